@@ -1,0 +1,57 @@
+# make demo   the whole pipeline at its smallest: a report to look at in runs/demo
+# make test   lint, types and tests
+# Everything is installed into .venv; nothing outside this folder is touched.
+PYTHON ?= python3
+VENV ?= .venv
+DEMO_ARGS ?= --preset quick --out runs/demo
+BENCH_ARGS ?=
+PYTEST_ARGS ?=
+
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint bench clean
+
+help:
+	@sed -n 's/^# make/make/p' Makefile
+	@echo "make lint   ruff and mypy only"
+	@echo "make bench  speed, side by side with other packages (BENCH_ARGS=\"render\")"
+	@echo "make clean  remove .venv, builds and caches (never runs/)"
+
+# Stamps: reinstall only when the dependencies may have changed.
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; ok = (3, 11) <= v <= (3, 13); \
+	  sys.exit(None if ok else "palm_jax needs Python 3.11 to 3.13, $(PYTHON) is %d.%d: " \
+	  "call make with PYTHON=python3.12" % v)'
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.base: $(BIN)/python pyproject.toml
+	$(PIP) install --quiet -e .
+	@touch $@
+
+$(VENV)/.test: $(BIN)/python pyproject.toml
+	$(PIP) install --quiet -e '.[test]'
+	@touch $@ $(VENV)/.base
+
+$(VENV)/.bench: $(BIN)/python pyproject.toml
+	$(PIP) install --quiet -e '.[bench]'
+	@touch $@ $(VENV)/.base
+
+demo: $(VENV)/.base
+	$(BIN)/python -m palm_jax.train $(DEMO_ARGS)
+
+lint: $(VENV)/.test
+	$(BIN)/ruff check .
+	$(BIN)/mypy -p palm_jax
+
+test: lint
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+bench: $(VENV)/.bench
+	$(BIN)/python -m palm_jax bench $(BENCH_ARGS)
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+	find . -maxdepth 2 -name '*.egg-info' -prune -exec rm -rf {} +

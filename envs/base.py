@@ -1,0 +1,344 @@
+"""The environment: `Env`, its shiftable parameters `EnvParams` and its `State`.
+
+An episode: objects are placed in a region, a global policy finds the target in a rendered mask and the
+hand is put near it (`reset`), then a local policy moves the TCP by body-frame deltas (`step`). All
+functions are pure, for one world; batch them with `jax.vmap`. Everything that can shift is a leaf of
+`EnvParams`, so a sweep is a `vmap` over params.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from palm_jax.align import (
+    Aligned,
+    AlignSpec,
+    Camera,
+    align_window,
+    apply_delta,
+    encode_delta,
+    unproject_to_height,
+    window_origin,
+)
+from palm_jax.envs import control, physics
+from palm_jax.envs.robots import Robot
+from palm_jax.envs.scene import SceneModel
+from palm_jax.envs.tasks import TABLE_HEIGHT, WORKSPACE_CENTRE, Task
+from palm_jax.envs.world import build_spec
+from palm_jax.render import Frame, Window, render
+
+PAPER_FRAME = 512
+"""Side in pixels of the paper's raw image; other frames share its focal length."""
+
+WIDE_FRAME = 1024
+"""Side in pixels of the default virtual frame: wide enough that a TCP crop never clamps."""
+
+_LOCATE_SIZE = 128  # the mask for the global policy: the wide frame at an eighth
+_SUBSTEPS = 10
+CONTROL_RATE = 20.0
+"""Control steps a second."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class EnvParams:
+    """What can shift. Every field is a leaf (arrays without a batch axis; `vmap` for more)."""
+
+    camera_to_world: jax.Array  # [4, 4] nominal camera pose (OpenCV axes)
+    camera_fovy: jax.Array  # [] degrees, of the 512-pixel frame
+    camera_angle: jax.Array  # [2] range of the camera's turn about the workspace's vertical, radians
+    object_low: jax.Array  # [2] lower xy corner of the target object's region, metres
+    object_high: jax.Array  # [2] upper corner
+    object_yaw: jax.Array  # [2] range of the object's yaw in the world, radians
+    start_radius: jax.Array  # [] the hand starts within this of the located target, per axis, metres
+    start_height: jax.Array  # [2] range of the TCP's height above the table, metres
+    start_yaw: jax.Array  # [2] range of the hand's yaw, radians
+    align_hand: jax.Array  # [] 1: the hand's initial yaw turns with the camera, 0: it does not
+    light_ambient: jax.Array  # [3]
+    light_diffuse: jax.Array  # [L, 3]
+    light_direction: jax.Array  # [L, 3] direction the light travels in
+    geom_rgb: jax.Array  # [R, 3] colours of the rendered geoms, 0..1
+    robot_visible: jax.Array  # [] 1: drawn, 0: hidden in rendering (physics unchanged)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class State:
+    """One world in mid-episode."""
+
+    data: mjx.Data  # physics; poses agree with qpos
+    camera_to_world: jax.Array  # [4, 4] this episode's camera
+    camera_angle: jax.Array  # [] its turn from the nominal pose, radians
+    object_start: jax.Array  # [3] the target object's position at the start
+    object_yaw: jax.Array  # [] and its yaw
+    located: jax.Array  # [2] xy that the global policy found
+    seen: jax.Array  # bool []: the target was in the global policy's mask
+    step: jax.Array  # int32 [] control steps taken
+    success: jax.Array  # bool []: solved at some step so far
+    nan: jax.Array  # bool []: physics diverged; the world stays at its last finite state
+
+
+def _uniform(key: jax.Array, bounds: jax.Array) -> jax.Array:
+    return jax.random.uniform(key, (), minval=bounds[0], maxval=bounds[1])
+
+
+class Env:
+    """A task on a robot.
+
+    Actions are [10]: the body-frame delta of the TCP (6D rotation, then xyz in metres), then the gripper
+    (1 open, 0 close); 20 actions a second. `step` executes `tcp @ delta` from the measured TCP pose.
+
+    Attributes:
+      task: what is to be done.
+      robot: what does it.
+      mj_model: the compiled C MuJoCo model (physics parameters, names).
+      mjx_model: the same for MJX.
+      xml: the same as one MJCF file.
+    """
+
+    action_size = 10
+
+    def __init__(self, task: Task, robot: Robot) -> None:
+        self.task = task
+        self.robot = robot
+        spec = build_spec(robot, task.asset, task.contacts(robot))
+        self.mj_model: mujoco.MjModel = spec.compile()
+        self.xml: str = spec.to_xml()
+        self.mjx_model = mjx.put_model(self.mj_model)
+        self.scene_model = SceneModel(self.mj_model)
+        self.chain = control.arm_chain(self.mj_model, robot)
+        self._ids = task.bind(self.mj_model, robot)
+        self._tcp_site = self.mj_model.site("tcp").id
+        self._arm_qpos = self._addresses(robot.arm_joints)
+        self._gripper_qpos = self._addresses(robot.gripper_joints)
+        self._closed = np.asarray(robot.gripper_closed, np.float32)
+        self._open = np.asarray(robot.gripper_open, np.float32)
+        self._target_ids = np.array([self.mj_model.geom(g).id for g in task.target_geoms])
+
+    def _addresses(self, joints: tuple[str, ...]) -> np.ndarray:
+        return np.array([int(self.mj_model.joint(name).qposadr[0]) for name in joints])
+
+    def default_params(self) -> EnvParams:
+        """The training distribution: the paper's front camera, a 0.2 x 0.2 m region of the table."""
+        centre = np.asarray(WORKSPACE_CENTRE[:2])
+        lights = self.scene_model.lights
+        values = {
+            "camera_to_world": front_camera(),
+            "camera_fovy": 40.0,
+            "camera_angle": (0.0, 0.0),
+            "object_low": centre - 0.1,
+            "object_high": centre + 0.1,
+            "object_yaw": (-0.5, 0.5),
+            "start_radius": 0.06,
+            "start_height": self.task.start_height,
+            "start_yaw": (-0.5, 0.5),
+            "align_hand": 0.0,
+            "light_ambient": lights.ambient,
+            "light_diffuse": lights.diffuse,
+            "light_direction": lights.direction,
+            "geom_rgb": self.scene_model.rgb,
+            "robot_visible": 1.0,
+        }
+        return EnvParams(**{k: jnp.asarray(v, jnp.float32) for k, v in values.items()})
+
+    # -- episode -----------------------------------------------------------------------------------
+
+    def reset(self, key: jax.Array, params: EnvParams) -> State:
+        """Starts an episode: place the objects, locate the target, put the hand near it."""
+        place_key, hand_key = jax.random.split(key)
+        state = self.place(place_key, params)
+        return self.reposition(hand_key, self.locate(state, params), params)
+
+    def place(self, key: jax.Array, params: EnvParams) -> State:
+        """Objects and camera drawn from `params`; the arm at its raised home pose."""
+        xy_key, yaw_key, camera_key = jax.random.split(key, 3)
+        xy = jax.random.uniform(xy_key, (2,), minval=params.object_low, maxval=params.object_high)
+        yaw = _uniform(yaw_key, params.object_yaw)
+        angle = _uniform(camera_key, params.camera_angle)
+        placement = self.task.place(self._ids, self._home_qpos(), xy, yaw)
+        data = mjx.make_data(self.mjx_model).replace(
+            qpos=placement.qpos,
+            ctrl=self._servo_targets(jnp.asarray(self.chain.home), jnp.ones(())),
+            mocap_pos=placement.mocap_pos,
+            mocap_quat=placement.mocap_quat,
+        )
+        data = mjx.kinematics(self.mjx_model, data)
+        camera = Camera.from_fovy(params.camera_fovy, PAPER_FRAME, PAPER_FRAME, params.camera_to_world)
+        turned = camera.rotated_about(jnp.asarray(WORKSPACE_CENTRE), angle)
+        return State(
+            data=data,
+            camera_to_world=turned.cam_to_world,
+            camera_angle=angle,
+            object_start=self.task.object_position(self._ids, data),
+            object_yaw=yaw,
+            located=xy,
+            seen=jnp.ones((), bool),
+            step=jnp.zeros((), jnp.int32),
+            success=jnp.zeros((), bool),
+            nan=jnp.zeros((), bool),
+        )
+
+    def restore(
+        self,
+        qpos: jax.Array,
+        mocap_pos: jax.Array,
+        mocap_quat: jax.Array,
+        camera_to_world: jax.Array,
+        params: EnvParams,
+    ) -> State:
+        """A state to look at, from a recorded one: poses agree with `qpos` [nq], velocities are zero.
+
+        Args:
+          qpos: [nq]. mocap_pos: [nmocap, 3]. mocap_quat: [nmocap, 4]. camera_to_world: [4, 4].
+          params: where the rest comes from.
+        """
+        state = self.place(jax.random.key(0), params)
+        data = state.data.replace(qpos=qpos, mocap_pos=mocap_pos, mocap_quat=mocap_quat)
+        return dataclasses.replace(
+            state,
+            data=mjx.kinematics(self.mjx_model, data),
+            camera_to_world=camera_to_world,
+        )
+
+    def locate(self, state: State, params: EnvParams) -> State:
+        """The analytic global policy, first half: the target's xy from its rendered mask.
+
+        The centroid of the mask is carried along its ray to the object's centre height (paper, section
+        III-D). A target that is not in the mask leaves the workspace centre and `seen = False`.
+        """
+        camera = self.camera(state, params, frame=WIDE_FRAME).scaled(_LOCATE_SIZE / WIDE_FRAME)
+        frame = render(self.scene(state, params), camera, outputs=("segmentation",))
+        mask = jnp.isin(frame.segmentation, jnp.asarray(self._target_ids)).astype(jnp.float32)
+        count = mask.sum()
+        centre = jnp.arange(_LOCATE_SIZE) + 0.5
+        uv = jnp.stack([(mask.sum(0) * centre).sum(), (mask.sum(1) * centre).sum()])
+        point = unproject_to_height(camera, uv / jnp.maximum(count, 1.0), self.task.target_height)
+        xy = jnp.where(count > 0, point[:2], jnp.asarray(WORKSPACE_CENTRE[:2]))
+        return dataclasses.replace(state, located=xy, seen=count > 0)
+
+    def reposition(self, key: jax.Array, state: State, params: EnvParams) -> State:
+        """The global policy, second half: the TCP goes to a random xy near the located target."""
+        xy_key, height_key, yaw_key = jax.random.split(key, 3)
+        offset = jax.random.uniform(xy_key, (2,), minval=-1.0, maxval=1.0) * params.start_radius
+        height = TABLE_HEIGHT + _uniform(height_key, params.start_height)
+        yaw = _uniform(yaw_key, params.start_yaw) + params.align_hand * state.camera_angle
+        target = control.pointing_down(jnp.append(state.located + offset, height), yaw)
+        arm = control.reach(self.chain, jnp.asarray(self.chain.home), target)
+        data = state.data.replace(
+            qpos=state.data.qpos.at[self._arm_qpos].set(arm),
+            ctrl=self._servo_targets(arm, jnp.ones(())),
+        )
+        return dataclasses.replace(state, data=mjx.kinematics(self.mjx_model, data))
+
+    def step(self, state: State, action: jax.Array, params: EnvParams) -> State:
+        """One control step (50 ms) of `action` [10]; see the class. Latches success and NaN."""
+        del params  # physics does not shift (yet): the signature leaves room for it
+        target = apply_delta(self.tcp(state), action[:9])
+        arm = control.solve_ik(self.chain, state.data.qpos[self._arm_qpos], target)
+        gripper = (state.data.ctrl[-len(self._open) :] - self._closed) / (self._open - self._closed)
+        goal = jnp.where(action[9] > 0.5, 1.0, 0.0)
+        limit = self.robot.gripper_speed
+        opening = jnp.mean(gripper) + jnp.clip(goal - jnp.mean(gripper), -limit, limit)
+        data = physics.substeps(
+            self.mjx_model, state.data.replace(ctrl=self._servo_targets(arm, opening)), _SUBSTEPS
+        )
+        finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
+        nan = state.nan | ~finite
+        data = jax.tree.map(lambda new, old: jnp.where(nan, old, new), data, state.data)
+        solved = self.task.success(self._ids, data, state.object_start) & ~nan
+        return dataclasses.replace(
+            state, data=data, step=state.step + 1, success=state.success | solved, nan=nan
+        )
+
+    def expert(self, state: State) -> jax.Array:
+        """Action [10] of the scripted expert, which knows the true state."""
+        tcp = self.tcp(state)
+        command = self.task.expert(
+            self._ids, state.data, tcp, self.opening(state), state.object_start
+        )
+        delta = encode_delta(tcp, control.step_towards(tcp, command.target))
+        return jnp.append(delta, command.gripper)
+
+    # -- observation -------------------------------------------------------------------------------
+
+    def tcp(self, state: State) -> jax.Array:
+        """Pose [4, 4] of the TCP in the world."""
+        rotation, position = state.data.site_xmat[self._tcp_site], state.data.site_xpos[self._tcp_site]
+        return jnp.eye(4).at[:3, :3].set(rotation.reshape(3, 3)).at[:3, 3].set(position)
+
+    def opening(self, state: State) -> jax.Array:
+        """Opening of the gripper [], 0 closed .. 1 open."""
+        fingers = state.data.qpos[self._gripper_qpos]
+        return jnp.mean((fingers - self._closed) / (self._open - self._closed))
+
+    def object_position(self, state: State) -> jax.Array:
+        """Position [3] of the target object in the world."""
+        return self.task.object_position(self._ids, state.data)
+
+    def camera(self, state: State, params: EnvParams, *, frame: int = WIDE_FRAME) -> Camera:
+        """This episode's camera with a square image of `frame` pixels and the paper's focal length."""
+        paper = Camera.from_fovy(
+            params.camera_fovy, PAPER_FRAME, PAPER_FRAME, state.camera_to_world
+        )
+        centre = jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+        shift = (frame - PAPER_FRAME) / 2
+        return Camera(paper.K + shift * centre, state.camera_to_world, frame, frame)
+
+    def scene(self, state: State, params: EnvParams) -> Any:
+        """The world as the renderer's `Scene`."""
+        return self.scene_model(
+            state.data.geom_xpos,
+            state.data.geom_xmat.reshape(-1, 3, 3),
+            rgb=params.geom_rgb,
+            robot_visible=params.robot_visible,
+            ambient=params.light_ambient,
+            diffuse=params.light_diffuse,
+            direction=params.light_direction,
+        )
+
+    def observe(
+        self, state: State, params: EnvParams, spec: AlignSpec, *, frame: int = WIDE_FRAME
+    ) -> Aligned:
+        """What a policy sees: the aligned image [size, size, 3] uint8 and proprioception.
+
+        Only the pixels of the policy's window are rendered, at the policy's resolution. `frame` is the
+        side of the virtual full image that a `border="shift"` window must stay inside.
+        """
+        view = spec.view_camera(self.camera(state, params, frame=frame))
+        tcp = self.tcp(state)
+        origin, _ = window_origin(view, tcp, spec)
+        window = Window(origin, spec.size, spec.size)
+        image = render(self.scene(state, params), view, window).rgb
+        return align_window(image, view, origin, tcp, self.opening(state), spec)
+
+    def render(self, state: State, params: EnvParams, size: int, **options: Any) -> Frame:
+        """The paper's full frame at `size` x `size` pixels; options as in `palm_jax.render.render`."""
+        camera = self.camera(state, params, frame=PAPER_FRAME).scaled(size / PAPER_FRAME)
+        return render(self.scene(state, params), camera, **options)
+
+    # -- internals ---------------------------------------------------------------------------------
+
+    def _home_qpos(self) -> jax.Array:
+        qpos = jnp.asarray(self.mj_model.qpos0, jnp.float32)
+        qpos = qpos.at[self._arm_qpos].set(self.chain.home)
+        return qpos.at[self._gripper_qpos].set(self._open)
+
+    def _servo_targets(self, arm: jax.Array, opening: jax.Array) -> jax.Array:
+        fingers = self._closed + opening * (self._open - self._closed)
+        return jnp.concatenate([arm, fingers])
+
+
+def front_camera() -> np.ndarray:
+    """Pose [4, 4] of RLBench's front camera in OpenCV axes (looks at the robot, pitched 25 deg down)."""
+    sin, cos = np.sin(np.radians(25.0)), np.cos(np.radians(25.0))
+    right, down, forward = (0.0, 1.0, 0.0), (sin, 0.0, -cos), (-cos, 0.0, -sin)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, down, forward], -1)
+    pose[:3, 3] = (1.35, 0.0, 1.58)
+    return pose
+

@@ -1,0 +1,75 @@
+"""MJX stepping that is fast on CPUs and on accelerators.
+
+Two facts of XLA's CPU backend shape this file (figures in docs/performance.md):
+
+* its default fusion emitters make MJX about a thousand times slower, so physics is compiled with
+  `compiler_options()` of its own; the renderer and the networks want the default, so they live in other
+  jits (`jit_physics` is for physics alone);
+* inside `lax.scan`, fusions recompute kinematics across MJX's stages unless an `optimization_barrier`
+  stands between them.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from mujoco import mjx
+
+MAX_CPU_WORLDS = 128
+"""Larger batches fall off a cliff on XLA CPU: run them in chunks of at most this many worlds."""
+
+
+def compiler_options() -> dict[str, Any] | None:
+    """Options for `jax.jit` of anything that steps MJX on the default backend."""
+    if jax.default_backend() == "cpu":
+        return {"xla_cpu_use_fusion_emitters": False}
+    return None
+
+
+def jit_physics(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    """`jax.jit` with the compiler options that MJX needs."""
+    return jax.jit(function, compiler_options=compiler_options(), **options)
+
+
+_STAGES: tuple[Callable[[mjx.Model, mjx.Data], mjx.Data], ...] = (
+    mjx.kinematics,
+    mjx.com_pos,
+    mjx.crb,
+    mjx.factor_m,
+    mjx.collision,
+    mjx.make_constraint,
+    mjx.transmission,
+    mjx.fwd_velocity,
+    mjx.fwd_actuation,
+    mjx.fwd_acceleration,
+    mjx.solve,
+    mjx.implicit,
+)
+
+
+def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """One physics step: `mjx.step` for a model without tendons, sensors or moving cameras."""
+    for stage in _STAGES:
+        data = jax.lax.optimization_barrier(stage(model, data))
+    return data
+
+
+def substeps(model: mjx.Model, data: mjx.Data, count: int) -> mjx.Data:
+    """`count` physics steps with constant controls, then kinematics at the final `qpos`.
+
+    MuJoCo's step leaves body poses one step behind `qpos`; the final kinematics make what is rendered
+    and observed agree with the stored state.
+    """
+    data, _ = jax.lax.scan(lambda d, _: (step(model, d), None), data, None, length=count)
+    return mjx.kinematics(model, data)
+
+
+def in_contact(data: mjx.Data, first: int, second: int) -> jax.Array:
+    """Whether two geoms (ids) touch: bool []."""
+    contact = data._impl.contact
+    ids = jnp.asarray(contact.geom)
+    pair = ((ids[:, 0] == first) & (ids[:, 1] == second)) | (
+        (ids[:, 0] == second) & (ids[:, 1] == first)
+    )
+    return jnp.any(pair & (contact.dist < 0.0))

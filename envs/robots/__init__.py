@@ -1,0 +1,8 @@
+"""One table of robots. Adding one is one MJCF in `assets/robots/` and one row here."""
+
+from palm_jax.envs.robots.base import Robot
+from palm_jax.envs.robots.panda import PANDA
+
+ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (PANDA,)}
+
+__all__ = ["ROBOTS", "Robot"]

@@ -1,0 +1,162 @@
+"""Episodes in bulk.
+
+Two executions of the same episode. `Runner` keeps physics, rendering and the policy in separate jits, each
+with the compiler options it wants: the fast way on CPUs. `scan_episodes` is one `lax.scan` over everything,
+for accelerators, where one program avoids the host. Both give the same episodes up to rounding.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from palm_jax.align import Aligned, AlignSpec
+from palm_jax.envs import physics
+from palm_jax.envs.base import WIDE_FRAME, Env, EnvParams, State
+
+Act = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+"""Policy of a batch: (key, images [B, H, W, 3] uint8, proprio [B, P]) -> actions [B, 10]."""
+
+
+class Episodes(NamedTuple):
+    """Outcome of a batch of episodes; every field has the leading axis [N]."""
+
+    success: jax.Array  # bool: solved at some step, and physics stayed finite until then
+    nan: jax.Array  # bool: physics diverged
+    seen: jax.Array  # bool: the global policy saw the target
+    length: jax.Array  # int32: steps until success, or the horizon
+    object_xy: jax.Array  # [N, 2] where the target started, metres
+    object_yaw: jax.Array  # radians
+    camera_angle: jax.Array  # radians
+
+
+def _outcome(state: State, length: jax.Array) -> Episodes:
+    return Episodes(
+        success=state.success & ~state.nan,
+        nan=state.nan,
+        seen=state.seen,
+        length=length,
+        object_xy=state.object_start[..., :2],
+        object_yaw=state.object_yaw,
+        camera_angle=state.camera_angle,
+    )
+
+
+class Runner:
+    """The compiled pieces of an environment for a fixed number of worlds.
+
+    Every function is batched over [W] worlds: keys [W], states and params with a leading [W]. One `Runner`
+    compiles once and serves demonstrations, selection and evaluation alike.
+    """
+
+    def __init__(self, env: Env, worlds: int) -> None:
+        limit = physics.MAX_CPU_WORLDS
+        if not 0 < worlds <= limit and jax.default_backend() == "cpu":
+            raise ValueError(f"expected 1 to {limit} worlds a batch on CPU, got {worlds}: use chunks")
+        self.env = env
+        self.worlds = worlds
+        self.step = physics.jit_physics(jax.vmap(env.step))
+        self.expert = physics.jit_physics(jax.vmap(env.expert))
+        self._place = physics.jit_physics(jax.vmap(env.place))
+        self._locate = jax.jit(jax.vmap(env.locate))
+        self.restore = physics.jit_physics(jax.vmap(env.restore))
+        self._reposition = physics.jit_physics(jax.vmap(env.reposition))
+        self._observers: dict[tuple[AlignSpec, int], Callable[..., Aligned]] = {}
+
+    def reset(self, keys: jax.Array, params: EnvParams) -> State:
+        """`Env.reset` of W worlds, in three compiled pieces."""
+        keys = jax.vmap(jax.random.split)(keys)
+        state = self._place(keys[:, 0], params)
+        return self._reposition(keys[:, 1], self._locate(state, params), params)
+
+    def observe(
+        self, state: State, params: EnvParams, spec: AlignSpec, *, frame: int = WIDE_FRAME
+    ) -> Aligned:
+        """`Env.observe` of W worlds; compiled once for each `spec` and `frame`."""
+        if (spec, frame) not in self._observers:
+
+            def observe(state: State, params: EnvParams) -> Aligned:
+                return self.env.observe(state, params, spec, frame=frame)
+
+            self._observers[spec, frame] = jax.jit(jax.vmap(observe))
+        return self._observers[spec, frame](state, params)
+
+    def run(
+        self,
+        key: jax.Array,
+        keys: jax.Array,
+        params: EnvParams,
+        act: Act,
+        spec: AlignSpec,
+        *,
+        frame: int = WIDE_FRAME,
+        horizon: int | None = None,
+        watch: Callable[[State], None] | None = None,
+    ) -> Episodes:
+        """Runs W episodes of a policy; stops early once all are solved.
+
+        Args:
+          key: randomness of the policy.
+          keys: [W] one key a scene.
+          params: leading axis [W].
+          act: the policy.
+          spec, frame: what the policy sees, see `Env.observe`.
+          horizon: control steps, the task's own by default.
+          watch: called with every state, the first included (videos).
+        """
+        horizon = horizon or self.env.task.horizon
+        state = self.reset(keys, params)
+        length = np.full(self.worlds, horizon, np.int32)
+        for t in range(horizon):
+            if watch:
+                watch(state)
+            seen = self.observe(state, params, spec, frame=frame)
+            action = act(jax.random.fold_in(key, t), seen.image, seen.proprio)
+            state = self.step(state, action, params)
+            done = np.asarray(state.success | state.nan)
+            length = np.where(done, np.minimum(length, t + 1), length)
+            if done.all():
+                break
+        if watch:
+            watch(state)
+        return _outcome(state, jnp.asarray(length))
+
+
+def scan_episodes(
+    env: Env,
+    key: jax.Array,
+    keys: jax.Array,
+    params: EnvParams,
+    act: Act,
+    spec: AlignSpec,
+    *,
+    frame: int = WIDE_FRAME,
+    horizon: int | None = None,
+) -> Episodes:
+    """The same episodes as one jittable `lax.scan`; arguments as in `Runner.run`."""
+    horizon = horizon or env.task.horizon
+
+    def observe(state: State, params: EnvParams) -> Aligned:
+        return env.observe(state, params, spec, frame=frame)
+
+    def advance(
+        carry: tuple[State, jax.Array], t: jax.Array
+    ) -> tuple[tuple[State, jax.Array], None]:
+        state, length = carry
+        seen = jax.vmap(observe)(state, params)
+        action = act(jax.random.fold_in(key, t), seen.image, seen.proprio)
+        state = jax.vmap(env.step)(state, action, params)
+        done = state.success | state.nan
+        return (state, jnp.where(done, jnp.minimum(length, t + 1), length)), None
+
+    start = jax.vmap(env.reset)(keys, params)
+    length = jnp.full(keys.shape[0], horizon, jnp.int32)
+    (state, length), _ = jax.lax.scan(advance, (start, length), jnp.arange(horizon))
+    return _outcome(state, length)
+
+
+def repeat_params(params: EnvParams, count: int) -> EnvParams:
+    """`params` of one world with a leading axis [count]."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), params)

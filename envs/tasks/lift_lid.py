@@ -1,0 +1,30 @@
+"""Lift Lid: take the lid off a saucepan by its knob (RLBench's take_lid_off_saucepan, simplified).
+
+Solved when the knob is held and has risen by 0.105 m within 0.05 m of where it was: RLBench's detector is a
+box of 0.10 x 0.10 x 0.05 m whose bottom is 0.115 m above the knob's initial centre, which the top of the
+knob enters after 0.105 m.
+"""
+
+from palm_jax.envs.tasks.base import TABLE_HEIGHT
+from palm_jax.envs.tasks.lift import LiftTask
+
+LIFT_LID = LiftTask(
+    name="lift_lid",
+    asset="lift_lid.xml",
+    target_geoms=("lid_plate", "lid_dome", "lid_knob"),
+    target_height=TABLE_HEIGHT + 0.085,
+    start_height=(0.19, 0.24),
+    crop=160,
+    horizon=100,
+    body="lid",
+    mocap=(("pan", TABLE_HEIGHT),),
+    grasp_geom="knob_collision",
+    grasp_site="lid_grasp",
+    grasp_width=0.06,
+    supports=tuple((f"lid_foot{i}", "pan_collision") for i in range(4)),
+    tip_obstacles=("plate_collision",),
+    rest_height=TABLE_HEIGHT + 0.077,
+    lift_height=0.105,
+    lateral_limit=0.05,
+    aligned=False,
+)

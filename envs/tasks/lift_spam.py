@@ -1,0 +1,29 @@
+"""Lift Spam: pick a rectangular can across its short side and lift it 0.10 m.
+
+The paper gives no geometry for this task; the can has the size of the potted meat can of the YCB set, and
+success follows Lift Lid: held by both fingers, above a height.
+"""
+
+from palm_jax.envs.tasks.base import TABLE_HEIGHT
+from palm_jax.envs.tasks.lift import LiftTask
+
+LIFT_SPAM = LiftTask(
+    name="lift_spam",
+    asset="lift_spam.xml",
+    target_geoms=("spam_can", "spam_label", "spam_lid", "spam_rim"),
+    target_height=TABLE_HEIGHT + 0.04,
+    start_height=(0.15, 0.20),
+    crop=200,
+    horizon=100,
+    body="spam",
+    mocap=(),
+    grasp_geom="spam_collision",
+    grasp_site="spam_grasp",
+    grasp_width=0.05,
+    supports=(("spam_collision", "table"),),
+    tip_obstacles=("spam_collision",),
+    rest_height=TABLE_HEIGHT + 0.04,
+    lift_height=0.10,
+    lateral_limit=0.20,
+    aligned=True,
+)

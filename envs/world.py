@@ -1,0 +1,49 @@
+"""Builds the MuJoCo model of a task on a robot: table + robot + task objects + contact pairs.
+
+Nothing collides by default (`contype = conaffinity = 0` everywhere); every contact that can matter is an
+explicit pair. MJX evaluates every candidate on every step, so the list is what physics costs.
+"""
+
+import importlib.resources
+import pathlib
+from typing import NamedTuple
+
+import mujoco
+
+from palm_jax.envs.robots import Robot
+
+
+class Contact(NamedTuple):
+    """Two geoms that may touch, with their sliding friction coefficient."""
+
+    first: str
+    second: str
+    friction: float
+
+
+def asset_path(*parts: str) -> pathlib.Path:
+    """Path of a packaged MJCF file."""
+    return pathlib.Path(str(importlib.resources.files("palm_jax.envs") / "assets")).joinpath(*parts)
+
+
+def build_spec(robot: Robot, task_asset: str, contacts: tuple[Contact, ...]) -> mujoco.MjSpec:
+    """The world of one task on one robot, ready to `compile()`; `to_xml()` then gives it as one file.
+
+    Args:
+      robot: row of `ROBOTS`.
+      task_asset: MJCF file name inside `assets/tasks/`.
+      contacts: every pair of geoms that may touch.
+    """
+    files = ("table.xml", f"robots/{robot.asset}", f"tasks/{task_asset}")
+    include = {name: asset_path(*name.split("/")).read_bytes() for name in files}
+    return mujoco.MjSpec.from_string(_model_xml(files, contacts), include=include)
+
+
+def _model_xml(files: tuple[str, ...], contacts: tuple[Contact, ...]) -> str:
+    pairs = "".join(
+        f'<pair geom1="{c.first}" geom2="{c.second}" condim="3" '
+        f'friction="{c.friction} {c.friction} 0.005 0.0001 0.0001"/>'
+        for c in contacts
+    )
+    parts = "".join(f'<include file="{name}"/>' for name in files)
+    return f'<mujoco model="palm_jax">{parts}<contact>{pairs}</contact></mujoco>'

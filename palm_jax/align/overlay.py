@@ -1,0 +1,275 @@
+"""TCP overlay: the TCP's axes drawn as arrows, its origin as a dot.
+
+x red, y green, z blue, then a white dot; no occlusion test. Two rasterisers share the geometry:
+
+- `sharp` follows the reference, which draws on the full camera image before cropping: end points
+  cut to whole pixels, no antialiasing, edges as in PIL. Coverage is 0 or 1.
+- `smooth` is for images rendered at the policy's resolution, where the strokes are thinner than a
+  pixel: end points are exact and coverage is the fraction of the pixel, as the reference's strokes
+  look after its resize.
+
+Everything is a half-plane test on a [H, W] grid: about 60 operations a pixel, no branches.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+from palm_jax._checks import (
+    ShapeError,
+    as_image,
+    as_single,
+    check_pose,
+    check_range,
+    check_unit_range,
+)
+from palm_jax.align import camera as cam
+from palm_jax.align import pixels
+
+# PIL fills a polygon row by row and rounds both ends of the run to whole pixels: an edge reaches half
+# a pixel along the row. (Slightly less keeps exact ties away from the limit.)
+REACH = 0.47
+# Pixels exactly on an edge belong to the polygon; this is for the rounding of float32.
+ON_EDGE = 0.01
+
+
+@dataclasses.dataclass(frozen=True)
+class Strokes:
+    """Sizes of the drawing: axis_length in metres, the rest in pixels of the image drawn on."""
+
+    axis_length: float = 0.1
+    thickness: float = 2.0
+    arrow_length: float = 10.0
+    arrow_width: float = 10.0
+    dot_radius: float = 5.0
+
+    def scaled(self, factor: float) -> Strokes:
+        """The same drawing on an image with `factor` times the pixels."""
+        return Strokes(
+            self.axis_length,
+            self.thickness * factor,
+            self.arrow_length * factor,
+            self.arrow_width * factor,
+            self.dot_radius * factor,
+        )
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Points:
+    """Where the overlay goes, in pixels."""
+
+    uv: jax.Array  # [4, 2] origin, then the tips of x, y, z
+    drawn: jax.Array  # [4] bool: in front of the camera; without the origin nothing is
+
+
+def overlay_points(camera: cam.Camera, tcp: jax.Array, axis_length: ArrayLike) -> Points:
+    """Project the TCP's origin and the tips of its axes."""
+    steps = jnp.concatenate([jnp.zeros((3, 1)), jnp.eye(3)], 1) * axis_length
+    world = tcp[:3, 3] + cam.matmul(tcp[:3, :3], steps).T
+    uv, depth = cam._project(camera, world)
+    ahead = depth > cam.NEAREST_DEPTH
+    return Points(uv, ahead & ahead[0])
+
+
+def to_pixels(points: Points) -> Points:
+    """Cut the points to whole pixels, as the reference does before drawing."""
+    return Points(jnp.floor(points.uv), points.drawn)
+
+
+def _direction(vector: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Length of a [2] vector and its unit components; (1, 0) for a zero vector."""
+    square = vector[0] ** 2 + vector[1] ** 2
+    zero = square < 1e-12
+    length = jnp.sqrt(jnp.where(zero, 1.0, square))
+    unit_x = jnp.where(zero, 1.0, vector[0] / length)
+    return jnp.where(zero, 0.0, length), unit_x, vector[1] / length
+
+
+def _whole(value: jax.Array) -> jax.Array:
+    """Round to the nearest whole number, halves away from zero."""
+    return jnp.sign(value) * jnp.floor(jnp.abs(value) + 0.5)
+
+
+def _whole_down(value: jax.Array) -> jax.Array:
+    """Round to the nearest whole number, halves towards zero."""
+    return jnp.sign(value) * jnp.ceil(jnp.abs(value) - 0.5)
+
+
+def _sharp_line(x: jax.Array, y: jax.Array, end: jax.Array, thickness: ArrayLike) -> jax.Array:
+    """[H, W] bool: a line from (0, 0) to `end` (whole pixels), as PIL widens lines.
+
+    PIL moves the line's two sides by whole pixels, so an even thickness lies off centre.
+    """
+    length, dx, dy = _direction(end)
+    grow = (jnp.asarray(thickness, jnp.float32) - 1) / 2
+    more, less = _whole(grow), _whole_down(grow)
+    above = _whole_down(less * dy) * dy + _whole(more * dx) * dx
+    below = -_whole_down(more * dy) * dy - _whole(less * dx) * dx
+    slack = REACH * jnp.abs(dy) + ON_EDGE
+    along, across = dx * x + dy * y, dx * y - dy * x
+    within = (across <= above + slack) & (across >= below - slack)
+    return within & (along >= -REACH) & (along <= length + REACH)
+
+
+def _beyond(x: jax.Array, y: jax.Array, a: jax.Array, b: jax.Array, c: jax.Array) -> jax.Array:
+    """[H, W] bool: pixels on c's side of the line a-b, or touched by it."""
+    _, dx, dy = _direction(b - a)
+    side = jnp.sign(dx * (c[1] - a[1]) - dy * (c[0] - a[0]))
+    distance = side * (dx * (y - a[1]) - dy * (x - a[0]))
+    return distance >= -REACH * jnp.abs(dy) - ON_EDGE
+
+
+def _sharp_arrow(x: jax.Array, y: jax.Array, tip: jax.Array, strokes: Strokes) -> jax.Array:
+    """[H, W] bool: shaft to `arrow_length` before the tip, then a filled triangle."""
+    length, dx, dy = _direction(tip)
+    unit, normal = jnp.stack([dx, dy]), jnp.stack([-dy, dx])
+    neck = tip - strokes.arrow_length * unit
+    half = strokes.arrow_width / 2 * normal
+    # The small number keeps 5.9999995 from becoming pixel 5 where the reference gets 6.
+    cut = [jnp.floor(point + 1e-4) for point in (neck, neck + half, neck - half)]
+    shaft = _sharp_line(x, y, cut[0], strokes.thickness)
+    head = _beyond(x, y, tip, cut[1], cut[2]) & _beyond(x, y, cut[2], tip, cut[1])
+    head &= _beyond(x, y, cut[1], cut[2], tip)
+    return (shaft | head) & (length > 0)
+
+
+def sharp(points: Points, strokes: Strokes, rows: jax.Array, columns: jax.Array) -> list[jax.Array]:
+    """Four [H, W] coverages (0 or 1) for the x, y, z arrows and the dot.
+
+    Args:
+      points: on whole pixels.
+      strokes: sizes.
+      rows, columns: int [H], [W] pixel numbers, in the frame of the points.
+    """
+    origin = points.uv[0]
+    x = (columns.astype(jnp.float32) - origin[0])[None, :]
+    y = (rows.astype(jnp.float32) - origin[1])[:, None]
+    arrows = [_sharp_arrow(x, y, tip - origin, strokes) for tip in points.uv[1:]]
+    # PIL's disc in a box of +-r pixels holds the centres within about r + 3/8.
+    radius = jnp.asarray(strokes.dot_radius, jnp.float32)
+    dot = x * x + y * y <= radius * (radius + 0.75)
+    shapes = [*arrows, dot]
+    order = (1, 2, 3, 0)
+    return [(s & points.drawn[i]).astype(jnp.float32) for s, i in zip(shapes, order, strict=True)]
+
+
+def _smooth_arrow(x: jax.Array, y: jax.Array, tip: jax.Array, strokes: Strokes) -> jax.Array:
+    length, dx, dy = _direction(tip)
+    neck = length - strokes.arrow_length
+    along, across = dx * x + dy * y, jnp.abs(dx * y - dy * x)
+    # Signed distances to the edges; a pixel is covered from half a pixel outside to half inside.
+    ends = jnp.minimum(along - jnp.minimum(neck, 0.0), jnp.maximum(neck, 0.0) - along)
+    shaft = jnp.minimum(strokes.thickness / 2 - across, ends)
+    slope = strokes.arrow_width / (2 * max(strokes.arrow_length, 1e-6))
+    flank = (slope * (length - along) - across) / (1 + slope**2) ** 0.5
+    head = jnp.minimum(flank, along - neck)
+    covered = jnp.clip(jnp.maximum(shaft, head) + 0.5, 0.0, 1.0)
+    return jnp.where(length > 0, covered, 0.0)
+
+
+def smooth(points: Points, strokes: Strokes, height: int, width: int) -> list[jax.Array]:
+    """Four [H, W] coverages in [0, 1] for the x, y, z arrows and the dot; any points."""
+    origin = points.uv[0]
+    x = (jnp.arange(width, dtype=jnp.float32) + 0.5 - origin[0])[None, :]
+    y = (jnp.arange(height, dtype=jnp.float32) + 0.5 - origin[1])[:, None]
+    arrows = [_smooth_arrow(x, y, tip - origin, strokes) for tip in points.uv[1:]]
+    # (r^2 - d^2) / 2r equals r - d at the rim, where it matters, and needs no square root.
+    radius = max(strokes.dot_radius, 1e-6)
+    dot = jnp.clip((radius * radius - x * x - y * y) / (2 * radius) + 0.5, 0.0, 1.0)
+    shapes = [*arrows, dot]
+    order = (1, 2, 3, 0)
+    return [jnp.where(points.drawn[i], s, 0.0) for s, i in zip(shapes, order, strict=True)]
+
+
+def paint(image: jax.Array, coverage: list[jax.Array]) -> jax.Array:
+    """Lay red, green, blue, white over an image [H, W, 3] in that order, by their coverages."""
+    red, green, blue, white = coverage
+    rest = 1 - white
+    blue_left = 1 - blue
+    green_left = (1 - green) * blue_left
+    keep = (1 - red) * green_left * rest
+    added = (red * green_left * rest + white, green * blue_left * rest + white, blue * rest + white)
+    if image.dtype != jnp.uint8:
+        return image * keep[..., None] + jnp.stack(added, -1)
+    packed = pixels.pack(image)
+    return pixels.unpack([pixels.channel(packed, i) * keep + 255 * added[i] for i in range(3)])
+
+
+@jax.jit
+def _tcp_overlay(
+    image: jax.Array, camera: cam.Camera, tcp: jax.Array, strokes: dict[str, ArrayLike]
+) -> jax.Array:
+    style = Strokes(**strokes)  # type: ignore[arg-type]
+    points = to_pixels(overlay_points(camera, tcp, style.axis_length))
+    rows, columns = jnp.arange(camera.height), jnp.arange(camera.width)
+    return paint(image, sharp(points, style, rows, columns))
+
+
+def tcp_overlay(
+    image: ArrayLike,
+    camera: cam.Camera,
+    tcp: ArrayLike,
+    *,
+    axis_length: ArrayLike = 0.1,
+    thickness: ArrayLike = 2.0,
+    arrow_length: ArrayLike = 10.0,
+    arrow_width: ArrayLike = 10.0,
+    dot_radius: ArrayLike = 5.0,
+) -> jax.Array:
+    """Draw the TCP's axes and origin on the camera's image (PALM, TCP overlay).
+
+    Arrows in the order x red, y green, z blue, then a white dot, as the reference draws them: end
+    points cut to whole pixels; each shaft ends `arrow_length` before the tip, where a triangle of
+    that length begins; an axis shorter than that has a shaft that runs backwards. Nothing hides
+    the drawing. A calibration error (overlay jitter) is a shift of the principal point:
+    `camera.cropped(-jitter, height, width)`.
+
+    Args:
+      image: [H, W, 3] uint8 or float32 in [0, 1], the camera's size.
+      camera: the camera that took the image.
+      tcp: [4, 4] TCP pose in the world.
+      axis_length: metres.
+      thickness, arrow_length, arrow_width, dot_radius: pixels; `arrow_width` is the whole base.
+
+    Returns:
+      [H, W, 3], dtype of the image. Under jit and vmap: nothing is drawn if the TCP lies behind
+      the camera, an axis whose tip does is left out, and what falls outside the image is cut off.
+
+    Raises:
+      ShapeError, DtypeError: image not [H, W, 3] of uint8 or float; tcp not [4, 4].
+      OptionError: concrete float pixels outside [0, 1]; a negative size.
+      CameraError, PoseError: see `Camera.check`; concrete tcp not a rigid pose.
+      ProjectionError: concrete TCP behind the camera or outside its image.
+    """
+    image = as_image(image, "image", rgb=True)
+    tcp = as_single(tcp, "tcp", (4, 4))
+    camera.check()
+    check_size(image, camera)
+    check_pose(tcp, "tcp")
+    cam.check_tcp_in_view(camera, tcp, "tcp")
+    check_unit_range(image, "image")
+    strokes = {
+        "axis_length": axis_length,
+        "thickness": thickness,
+        "arrow_length": arrow_length,
+        "arrow_width": arrow_width,
+        "dot_radius": dot_radius,
+    }
+    for name, value in strokes.items():
+        check_range(value, name, 0.0, float("inf"))
+    return _tcp_overlay(image, camera, tcp, strokes)
+
+
+def check_size(image: jax.Array, camera: cam.Camera) -> None:
+    """Raise ShapeError unless the image has the camera's size."""
+    if image.shape[:2] != (camera.height, camera.width):
+        raise ShapeError(
+            f"image: expected the camera's {camera.height} x {camera.width} pixels, got "
+            f"{image.shape[0]} x {image.shape[1]}; use camera.scaled or camera.cropped to describe "
+            "a resized or cropped image"
+        )

@@ -1,0 +1,40 @@
+"""`python -m palm_jax.train`: demonstrations, training, evaluation and report in one command."""
+
+import sys
+import warnings
+from collections.abc import Sequence
+
+from palm_jax._quiet import without_lines
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns 0, or 2 for a command that cannot be run, 130 when interrupted."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    if not {"-h", "--help"} & set(words):
+        print("palm_jax: loading JAX and MuJoCo ...", flush=True)
+    warnings.filterwarnings("ignore", message=".*donated buffers were not usable.*")
+    with without_lines():  # MJX's complaints about the missing warp back end
+        from palm_jax.train import config as configuration
+        from palm_jax.train import console as terminal
+        from palm_jax.train import run
+        from palm_jax.train.demos import DemoFileError
+
+    console = terminal.make_console()
+    try:
+        config = configuration.parse(words)
+    except configuration.ConfigError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    try:
+        run.execute(config, console)
+    except (configuration.ConfigError, DemoFileError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        terminal.interrupted(console, run.resume_command(config))
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

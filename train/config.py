@@ -1,0 +1,246 @@
+"""What a training command is told: one frozen dataclass, filled by a preset and the command line."""
+
+import dataclasses
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+
+import tyro
+
+from palm_jax.envs.registry import ROBOTS, TASKS
+from palm_jax.envs.shifts import DOMAINS
+from palm_jax.train import methods
+from palm_jax.train.learner import LearnerConfig
+
+
+class ConfigError(ValueError):
+    """A command that cannot be run; the message says what was expected, what came, what to do."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Train policies and evaluate them under distribution shift.
+
+    Attributes:
+      task: what to learn.
+      method: one or more methods; with several, each gets a folder of its own inside `out`.
+      preset: where the defaults come from: quick, cpu or paper.
+      seed: of training. Demonstrations and evaluation scenes have seeds of their own.
+      out: the run folder; by default runs/PRESET-TASK-METHODS-sSEED.
+      resume: go on with the run in `out`.
+      robot: which arm.
+      data: demonstrations to use (made if the file does not exist); by default inside `out`.
+      demos: number of demonstrations.
+      demo_seed: of the demonstrations.
+      demo_noise: disturbance while demonstrating, metres (standard deviation).
+      image_size: side of the policy's image in pixels, before the random crop.
+      random_crop: side of the random crop in pixels (centre crop when acting).
+      width: base width of the ResNet-18; the paper's is 64.
+      norm: group or batch.
+      steps: updates.
+      batch_size: samples an update.
+      learning_rate: of Adam, after the warm-up.
+      schedule: cosine or constant.
+      warmup_steps: updates of linear warm-up.
+      weight_decay: decoupled; 0 for none.
+      ema: decay of the averaged parameters that act; 0 for none.
+      overlay_warmup: updates before Random Overlay starts.
+      backgrounds: a folder of your own images for Random Overlay; procedural textures by default.
+      checkpoint_every: updates between checkpoints; each is scored in-domain from `select_from` on.
+      select_from: share of the training after which checkpoints are scored.
+      select_scenes: in-domain scenes that score a checkpoint.
+      keep: checkpoints kept, by score.
+      scenes: evaluation scenes in each domain.
+      eval_seed: of the evaluation scenes.
+      domains: evaluation domains.
+      videos: episodes filmed for each outcome (success, failure) and method.
+      sweep: draw the success heatmaps and camera-angle curves after training.
+    """
+
+    task: str = "lift_lid"
+    method: tuple[str, ...] = ("palm", "bc")
+    preset: str = "quick"
+    seed: int = 0
+    out: Path | None = None
+    resume: bool = False
+    robot: str = "panda"
+    data: Path | None = None
+    demos: int = 60
+    demo_seed: int = 0
+    demo_noise: float = 0.004
+    image_size: int = 84
+    random_crop: int = 76
+    width: int = 16
+    norm: str = "group"
+    steps: int = 1200
+    batch_size: int = 64
+    learning_rate: float = 1e-3
+    schedule: str = "cosine"
+    warmup_steps: int = 100
+    weight_decay: float = 0.0
+    ema: float = 0.99
+    overlay_warmup: int = 200
+    backgrounds: Path | None = None
+    checkpoint_every: int = 400
+    select_from: float = 0.6
+    select_scenes: int = 24
+    keep: int = 3
+    scenes: int = 24
+    eval_seed: int = 1000
+    domains: tuple[str, ...] = DOMAINS
+    videos: int = 1
+    sweep: bool = True
+
+    def learner(self, method: methods.Method) -> LearnerConfig:
+        """The learner's configuration for a method: the same for all, but for augmentation."""
+        return LearnerConfig(
+            width=self.width,
+            norm=self.norm,
+            crop=self.random_crop,
+            batch_size=self.batch_size,
+            steps=self.steps,
+            learning_rate=self.learning_rate,
+            schedule=self.schedule,
+            warmup_steps=self.warmup_steps,
+            weight_decay=self.weight_decay,
+            ema=self.ema,
+            overlay_fraction=0.5 if method.augment else 0.0,
+            overlay_warmup_steps=self.overlay_warmup,
+            perspective_probability=0.5 if method.augment else 0.0,
+        )
+
+    def check(self) -> None:
+        """Raises ConfigError for values that cannot work."""
+        _known("task", [self.task], TASKS)
+        _known("robot", [self.robot], ROBOTS)
+        _known("method", self.method, methods.METHODS)
+        _known("domain", self.domains, DOMAINS)
+        if "in_domain" not in self.domains:
+            raise ConfigError("domains must contain in_domain: degradation is relative to it")
+        for name in ("demos", "scenes", "select_scenes", "steps", "checkpoint_every", "keep"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if self.random_crop > self.image_size:
+            raise ConfigError(
+                f"random_crop: expected at most image_size = {self.image_size}, "
+                f"got {self.random_crop}"
+            )
+        if self.backgrounds is not None and not self.backgrounds.is_dir():
+            raise ConfigError(f"backgrounds: {self.backgrounds} is not a folder")
+        for method in self.method:
+            self.learner(methods.find(method))
+
+
+def _known(what: str, names: Sequence[str], known: Sequence[str] | dict[str, object]) -> None:  # type: ignore[type-arg]
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, list(known), n=1)
+            hint = f" (did you mean {near[0]!r}?)" if near else ""
+            raise ConfigError(f"unknown {what} {name!r}{hint}; known: {', '.join(known)}")
+
+
+def quick() -> Config:
+    """`python -m palm_jax.train`: PALM beside BC on one task, about 12 minutes on two cores."""
+    return Config()
+
+
+def cpu() -> Config:
+    """`python -m palm_jax.train --preset cpu --task lift_spam`: 50 scenes a domain, about 10 minutes a policy."""
+    return dataclasses.replace(
+        Config(),
+        preset="cpu",
+        demos=200,
+        steps=4000,
+        checkpoint_every=500,
+        select_scenes=50,
+        scenes=50,
+        overlay_warmup=500,
+    )
+
+
+def paper() -> Config:
+    """`python -m palm_jax.train --preset paper`: the paper's network and schedule; wants a GPU.
+
+    Width 64 from scratch (no ImageNet weights are shipped, so the encoder's rate is not scaled down),
+    batch norm, Adam 1e-4 without schedule, batch 64, 600 epochs of about 10 000 frames.
+    """
+    return dataclasses.replace(
+        Config(),
+        preset="paper",
+        demos=200,
+        width=64,
+        norm="batch",
+        learning_rate=1e-4,
+        schedule="constant",
+        warmup_steps=0,
+        ema=0.0,
+        steps=94_000,
+        checkpoint_every=7_800,
+        select_from=0.0,
+        select_scenes=50,
+        scenes=50,
+        overlay_warmup=1_600,
+    )
+
+
+PRESETS = {"quick": quick, "cpu": cpu, "paper": paper}
+"""Defaults by name; the command line overrides single fields."""
+
+
+def parse(argv: Sequence[str]) -> Config:
+    """The configuration of a command line: the preset's, with what is given instead.
+
+    Raises:
+      ConfigError: an unknown preset, task, method, robot or domain, or an impossible value.
+      SystemExit: `--help`, or an unknown option (the known ones are printed).
+    """
+    name = _preset(argv)
+    _known("preset", [name], PRESETS)
+    fields = {f"--{f.name.replace('_', '-')}" for f in dataclasses.fields(Config)}
+    for word in argv:
+        option = word.split("=")[0].replace("_", "-")
+        plain = option.replace("--no-", "--", 1)
+        if option.startswith("--") and plain not in fields | {"--help"}:
+            near = difflib.get_close_matches(option, fields, n=1)
+            hint = f" (did you mean {near[0]}?)" if near else ""
+            raise ConfigError(f"unknown option {option}{hint}; known: {', '.join(sorted(fields))}")
+    config: Config = tyro.cli(
+        Config, args=list(argv), default=PRESETS[name](), prog="python -m palm_jax.train"
+    )
+    config.check()
+    return config
+
+
+def _preset(argv: Sequence[str]) -> str:
+    for index, word in enumerate(argv):
+        if word.startswith("--preset="):
+            return word.partition("=")[2]
+        if word == "--preset" and index + 1 < len(argv):
+            return argv[index + 1]
+    return "quick"
+
+
+def default_out(config: Config) -> Path:
+    """Where a run goes that was not told where."""
+    name = "-".join((config.preset, config.task, *config.method))
+    return Path("runs") / f"{name}-s{config.seed}"
+
+
+def command(config: Config, *, resume: bool = False) -> list[str]:
+    """The command line that gives this configuration again."""
+    base, words = PRESETS[config.preset](), ["python", "-m", "palm_jax.train"]
+    words += ["--preset", config.preset]
+    for field in dataclasses.fields(Config):
+        value = getattr(config, field.name)
+        if field.name in ("preset", "resume") or value == getattr(base, field.name):
+            continue
+        flag = f"--{field.name.replace('_', '-')}"
+        if isinstance(value, bool):
+            words.append(flag if value else flag.replace("--", "--no-", 1))
+        elif isinstance(value, tuple):
+            words += [flag, *map(str, value)]
+        else:
+            words += [flag, str(value)]
+    return [*words, "--resume"] if resume else words
+
+

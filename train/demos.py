@@ -1,0 +1,275 @@
+"""Demonstrations: a robomimic-style HDF5 file of states, and the images rendered from it on demand.
+
+Layout: `data/demo_i/{states, actions, obs/{tcp, opening, qpos, qvel}, env_params/*}`. `states` rows are
+time, qpos, qvel as in robomimic; a demo's attributes hold `num_samples`, `model_file` (MJCF), `camera_info`
+(JSON: intrinsics and camera-to-world extrinsics of the 512-pixel front image, OpenCV axes), its seed and the
+mocap poses. `data` has `total`, `env_args` (JSON) and the provenance. No pixels: they depend on the method.
+"""
+
+import dataclasses
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from palm_jax.align import AlignSpec
+from palm_jax.envs.base import PAPER_FRAME, Env, EnvParams
+from palm_jax.envs.expert import Demonstrator, Recording
+from palm_jax.envs.rollout import Runner, repeat_params
+
+FORMAT = "palm_jax-demos"
+VERSION = 1
+
+
+class DemoFileError(ValueError):
+    """A demonstration file that cannot be used; the message says which and why."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Demos:
+    """Demonstrations as flat arrays over N frames of E episodes."""
+
+    qpos: np.ndarray  # [N, nq]
+    tcp: np.ndarray  # [N, 4, 4]
+    opening: np.ndarray  # [N]
+    actions: np.ndarray  # [N, 10]
+    episode: np.ndarray  # [N] index of the frame's episode
+    mocap_pos: np.ndarray  # [E, nmocap, 3]
+    mocap_quat: np.ndarray  # [E, nmocap, 4]
+    camera_to_world: np.ndarray  # [E, 4, 4]
+    params: EnvParams  # leading axis [E]
+    attempts: int  # episodes that the expert needed
+
+    @property
+    def episodes(self) -> int:
+        return len(self.camera_to_world)
+
+
+def collect(
+    runner: Runner,
+    path: Path,
+    *,
+    count: int,
+    seed: int,
+    noise: float,
+    progress: Callable[[int], None] | None = None,
+) -> Path:
+    """Records `count` successful demonstrations of the perturbed expert into `path`.
+
+    Args:
+      runner: compiled environment.
+      path: the file; written under another name and moved when whole.
+      count: successful demonstrations to keep.
+      seed: every scene and disturbance follows from it.
+      noise: standard deviation of the disturbance, metres.
+      progress: told how many were kept after each batch.
+
+    Raises:
+      FileExistsError: `path` exists; nothing is ever overwritten.
+      RuntimeError: the expert fails so often that `count` is out of reach.
+    """
+    if path.exists():
+        raise FileExistsError(f"{path} exists and is not overwritten: move it, or choose another name")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    demonstrator = Demonstrator(runner)
+    params = repeat_params(runner.env.default_params(), runner.worlds)
+    root = jax.random.fold_in(jax.random.key(seed), 0xDE305)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    kept = attempts = 0
+    try:
+        with h5py.File(partial, "w") as file:
+            data = file.create_group("data")
+            for batch in range(4 * (count // runner.worlds + 1)):
+                key, scenes = jax.random.split(jax.random.fold_in(root, batch))
+                keys = jax.random.split(scenes, runner.worlds)
+                recording = demonstrator(key, keys, params, noise=noise)
+                for world in np.flatnonzero(recording.success)[: count - kept]:
+                    attempts_now = attempts + int(world) + 1
+                    _write_demo(data, kept, runner.env, recording, int(world), params, (seed, batch))
+                    kept += 1
+                attempts = attempts_now if kept == count else attempts + runner.worlds
+                if progress:
+                    progress(kept)
+                if kept == count:
+                    break
+            else:
+                raise RuntimeError(f"the expert solved only {kept} of {attempts} scenes")
+            _write_header(data, runner.env, seed=seed, noise=noise, attempts=attempts)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
+
+
+def _write_demo(
+    data: h5py.Group,
+    index: int,
+    env: Env,
+    recording: Recording,
+    world: int,
+    params: EnvParams,
+    seed: tuple[int, int],
+) -> None:
+    length = int(recording.length[world])
+    frames = jax.tree.map(lambda x: x[:length, world], recording.frames)
+    start = jax.tree.map(lambda x: np.asarray(x[world]), recording.start)
+    demo = data.create_group(f"demo_{index}")
+    time = np.arange(length, dtype=np.float32)[:, None] / 20.0
+    demo["states"] = np.concatenate([time, frames.qpos, frames.qvel], -1).astype(np.float32)
+    demo["actions"] = frames.action.astype(np.float32)
+    demo["dones"] = frames.success.astype(np.uint8)
+    demo["rewards"] = frames.success.astype(np.float32)
+    for name in ("tcp", "opening", "qpos", "qvel"):
+        demo[f"obs/{name}"] = getattr(frames, name).astype(np.float32)
+    for field in dataclasses.fields(EnvParams):
+        demo[f"env_params/{field.name}"] = np.asarray(getattr(params, field.name)[world])
+    focal = PAPER_FRAME / 2 / np.tan(np.radians(float(params.camera_fovy[world])) / 2)
+    half = PAPER_FRAME / 2
+    demo.attrs.update(
+        {
+            "num_samples": length,
+            "model_file": env.xml,
+            "camera_info": json.dumps(
+                {
+                    "front": {
+                        "intrinsics": [[focal, 0.0, half], [0.0, focal, half], [0.0, 0.0, 1.0]],
+                        "extrinsics": start.camera_to_world.tolist(),
+                    }
+                }
+            ),
+            "seed": list(seed) + [world],
+            "camera_to_world": start.camera_to_world,
+            "mocap_pos": start.data.mocap_pos.reshape(-1, 3),
+            "mocap_quat": start.data.mocap_quat.reshape(-1, 4),
+        }
+    )
+
+
+def _write_header(data: h5py.Group, env: Env, *, seed: int, noise: float, attempts: int) -> None:
+    data.attrs.update(
+        {
+            "total": sum(int(demo.attrs["num_samples"]) for demo in data.values()),
+            "env_args": json.dumps(
+                {
+                    "env_name": env.task.name,
+                    "env_type": "palm_jax",
+                    "env_kwargs": {"task": env.task.name, "robot": env.robot.name},
+                }
+            ),
+            "format": FORMAT,
+            "version": VERSION,
+            "task": env.task.name,
+            "robot": env.robot.name,
+            "seed": seed,
+            "noise": noise,
+            "attempts": attempts,
+            "label": "commanded body-frame delta relative to the measured TCP pose",
+        }
+    )
+
+
+def load(path: Path, *, task: str, robot: str, count: int | None = None) -> Demos:
+    """Reads demonstrations and checks that they are what is asked for.
+
+    Args:
+      path: file written by `collect`.
+      task, robot: what the file must be of.
+      count: number of demonstrations to use; all by default.
+
+    Raises:
+      DemoFileError: truncated, of another task, robot or version, or with too few demonstrations.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            return _read(file["data"], path, task, robot, count)
+    except DemoFileError:
+        raise
+    except (OSError, KeyError, RuntimeError, ValueError) as error:
+        raise DemoFileError(
+            f"{path} is not a whole demonstration file ({error}); move it away and collect again"
+        ) from error
+
+
+def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None) -> Demos:
+    expected = {"format": FORMAT, "version": VERSION, "task": task, "robot": robot}
+    for name, value in expected.items():
+        found = data.attrs.get(name)
+        if found != value:
+            raise DemoFileError(f"{path}: expected {name} {value!r}, found {found!r}")
+    demos = [data[f"demo_{i}"] for i in range(len(data))]
+    if count is not None:
+        if len(demos) < count:
+            raise DemoFileError(f"{path}: expected {count} demonstrations, found {len(demos)}")
+        demos = demos[:count]
+    lengths = [len(demo["actions"]) for demo in demos]
+    params = {
+        f.name: np.stack([demo[f"env_params/{f.name}"][()] for demo in demos])
+        for f in dataclasses.fields(EnvParams)
+    }
+    arrays = {
+        "qpos": np.concatenate([demo["obs/qpos"][()] for demo in demos]),
+        "tcp": np.concatenate([demo["obs/tcp"][()] for demo in demos]),
+        "opening": np.concatenate([demo["obs/opening"][()] for demo in demos]),
+        "actions": np.concatenate([demo["actions"][()] for demo in demos]),
+    }
+    for name, array in arrays.items():
+        if len(array) != sum(lengths) or not np.isfinite(array).all():
+            raise DemoFileError(f"{path}: {name} is incomplete or not finite; collect again")
+    return Demos(
+        **arrays,
+        episode=np.repeat(np.arange(len(demos)), lengths),
+        mocap_pos=np.stack([demo.attrs["mocap_pos"] for demo in demos]),
+        mocap_quat=np.stack([demo.attrs["mocap_quat"] for demo in demos]),
+        camera_to_world=np.stack([demo.attrs["camera_to_world"] for demo in demos]),
+        params=EnvParams(**{name: jnp.asarray(value) for name, value in params.items()}),
+        attempts=int(data.attrs["attempts"]),
+    )
+
+
+def render_observations(
+    runner: Runner, demos: Demos, spec: AlignSpec, *, frame: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a policy would have seen in every frame of the demonstrations.
+
+    Args:
+      runner: compiled environment; its number of worlds is the batch size here.
+      demos: states to render.
+      spec, frame: see `Env.observe`.
+
+    Returns:
+      images [N, size, size, 3] uint8 and proprioception [N, P] float32.
+    """
+    total, worlds = len(demos.qpos), runner.worlds
+    images, proprio = [], []
+    for first in range(0, total, worlds):
+        rows = np.minimum(np.arange(first, first + worlds), total - 1)
+        episode = demos.episode[rows]
+        params = jax.tree.map(lambda x, e=episode: x[e], demos.params)
+        state = runner.restore(
+            jnp.asarray(demos.qpos[rows]),
+            jnp.asarray(demos.mocap_pos[episode], jnp.float32),
+            jnp.asarray(demos.mocap_quat[episode], jnp.float32),
+            jnp.asarray(demos.camera_to_world[episode], jnp.float32),
+            params,
+        )
+        seen = runner.observe(state, params, spec, frame=frame)
+        images.append(np.asarray(seen.image))
+        proprio.append(np.asarray(seen.proprio))
+    return np.concatenate(images)[:total], np.concatenate(proprio)[:total]
+
+
+def summary(demos: Demos) -> dict[str, Any]:
+    """Numbers worth printing."""
+    lengths = np.bincount(demos.episode)
+    return {
+        "demonstrations": demos.episodes,
+        "frames": len(demos.qpos),
+        "steps per demonstration": f"{lengths.mean():.0f} ({lengths.min()}-{lengths.max()})",
+        "expert success": f"{demos.episodes}/{demos.attempts}",
+    }

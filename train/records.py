@@ -1,0 +1,216 @@
+"""What an evaluation or a sweep leaves behind, on disk and in memory.
+
+A run folder holds (see `docs/reproduce.md`)::
+
+    config.json env.json metrics.jsonl checkpoints/ eval.json eval.npz [sweep.npz] ...
+
+`eval.json` is `{domain: {"successes": int, "episodes": int, "nan": int}}`; `eval.npz` holds the
+same episodes one by one as arrays named `domain/field`, the fields of `DomainRecord`; `sweep.npz`
+holds the arrays of `Sweep`. Readers raise `RecordError`, which names the file and the problem.
+"""
+
+import io
+import json
+import warnings
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from palm_jax.train.metrics import read_metrics, write_atomic
+
+
+class RecordError(ValueError):
+    """A file of a run folder that cannot be used; the message says which and why."""
+
+
+@dataclass(frozen=True)
+class DomainRecord:
+    """The N episodes of one policy in one domain."""
+
+    success: NDArray[np.bool_]  # [N]
+    nan: NDArray[np.bool_]  # [N] physics or policy went non-finite: counted, and a failure
+    object_xy: NDArray[np.float32]  # [N, 2] metres, world: the target object at the start
+    camera_angle: NDArray[np.float32]  # [N] radians about the workspace centre; 0 in training
+    length: NDArray[np.int32]  # [N] control steps until success or the end
+
+    @property
+    def episodes(self) -> int:
+        return len(self.success)
+
+    @property
+    def solved(self) -> NDArray[np.bool_]:
+        """[N] successes that count: a non-finite episode never does."""
+        return self.success & ~self.nan
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """S episodes in every cell of a grid of camera angles and object positions."""
+
+    angles: NDArray[np.float64]  # [A] radians
+    xs: NDArray[np.float64]  # [X] metres, cell centres
+    ys: NDArray[np.float64]  # [Y] metres, cell centres
+    success: NDArray[np.bool_]  # [A, X, Y, S]
+    nan: NDArray[np.bool_]  # [A, X, Y, S]
+
+    @property
+    def solved(self) -> NDArray[np.bool_]:
+        """[A, X, Y, S] successes that count: a non-finite episode never does."""
+        return self.success & ~self.nan
+
+
+_DTYPES: dict[str, Any] = {
+    "success": np.bool_,
+    "nan": np.bool_,
+    "object_xy": np.float32,
+    "camera_angle": np.float32,
+    "length": np.int32,
+}
+
+
+def domain_record(values: Mapping[str, ArrayLike], *, where: str = "record") -> DomainRecord:
+    """Check and convert the five arrays of one domain; `where` names them in errors."""
+    missing = sorted(set(_DTYPES) - set(values))
+    if missing:
+        raise RecordError(f"{where}: missing {', '.join(missing)}; expected {', '.join(_DTYPES)}")
+    arrays = {name: np.asarray(values[name]).astype(kind) for name, kind in _DTYPES.items()}
+    count = arrays["success"].shape[0] if arrays["success"].ndim else 0
+    for name, array in arrays.items():
+        expected = (count, 2) if name == "object_xy" else (count,)
+        if array.shape != expected:
+            raise RecordError(
+                f"{where}/{name}: expected shape {expected} (as many episodes as success has), "
+                f"got {array.shape}"
+            )
+    return DomainRecord(**arrays)
+
+
+def counts(records: Mapping[str, DomainRecord]) -> dict[str, dict[str, int]]:
+    """The content of eval.json: successes, episodes and non-finite episodes per domain."""
+    return {
+        name: {
+            "successes": int(record.solved.sum()),
+            "episodes": record.episodes,
+            "nan": int(record.nan.sum()),
+        }
+        for name, record in records.items()
+    }
+
+
+def _write_arrays(path: Path, arrays: Mapping[str, ArrayLike]) -> Path:
+    content = io.BytesIO()
+    np.savez_compressed(content, allow_pickle=False, **arrays)
+    return write_atomic(path, content.getvalue())
+
+
+def save_eval(path: Path, records: Mapping[str, Mapping[str, ArrayLike] | DomainRecord]) -> Path:
+    """Write eval.npz, whole or not at all.
+
+    Args:
+      path: the file, by custom RUN/eval.npz.
+      records: per domain either a `DomainRecord` or a mapping with its fields.
+    """
+    arrays = {}
+    for domain, values in records.items():
+        if isinstance(values, DomainRecord):
+            record = values
+        else:
+            record = domain_record(values, where=domain)
+        for field in fields(record):
+            arrays[f"{domain}/{field.name}"] = getattr(record, field.name)
+    return _write_arrays(path, arrays)
+
+
+def save_sweep(path: Path, sweep: Sweep) -> Path:
+    """Write sweep.npz, whole or not at all."""
+    return _write_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
+
+
+def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    try:
+        # From memory: NumPy leaves a file that it cannot read open.
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise RecordError(f"{path}: not a readable .npz file ({error})") from error
+
+
+def load_eval(path: Path) -> dict[str, DomainRecord]:
+    """Read eval.npz; the domains come in the order in which they were written."""
+    grouped: dict[str, dict[str, NDArray[Any]]] = {}
+    for name, array in _load_arrays(path).items():
+        domain, _, field = name.rpartition("/")
+        if not domain:
+            raise RecordError(f"{path}: array {name!r} is not named domain/field")
+        grouped.setdefault(domain, {})[field] = array
+    return {
+        name: domain_record(values, where=f"{path}: {name}") for name, values in grouped.items()
+    }
+
+
+def load_sweep(path: Path) -> Sweep:
+    """Read sweep.npz."""
+    arrays = _load_arrays(path)
+    missing = {"angles", "xs", "ys", "success"} - set(arrays)
+    if missing:
+        raise RecordError(f"{path}: missing {', '.join(sorted(missing))}")
+    success = arrays["success"].astype(bool)
+    nan = arrays.get("nan", np.zeros_like(success)).astype(bool)
+    angles, xs, ys = (np.atleast_1d(arrays[name]).astype(float) for name in ("angles", "xs", "ys"))
+    grid = (len(angles), len(xs), len(ys))
+    for name, array in (("success", success), ("nan", nan)):
+        if array.ndim != 4 or array.shape[:3] != grid or array.shape != success.shape:
+            raise RecordError(
+                f"{path}: {name}: expected shape [angles, xs, ys, episodes] = {grid} + (S,), "
+                f"got {array.shape}"
+            )
+    return Sweep(angles, xs, ys, success, nan)
+
+
+def load_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise RecordError(f"{path}: not readable as JSON ({error})") from error
+    if not isinstance(content, dict):
+        raise RecordError(f"{path}: expected a JSON object, got {type(content).__name__}")
+    return content
+
+
+def load_counts(path: Path) -> dict[str, dict[str, int]]:
+    """Read eval.json and check that every domain holds sane counts."""
+    result = {}
+    for domain, entry in load_json(path).items():
+        try:
+            good, total = int(entry["successes"]), int(entry["episodes"])
+            nan = int(entry.get("nan", 0))
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise RecordError(
+                f"{path}: {domain}: expected successes, episodes and nan, got {entry!r}"
+            ) from error
+        if not 0 <= good <= total or not 0 <= nan <= total:
+            raise RecordError(f"{path}: {domain}: impossible counts {entry!r}")
+        result[domain] = {"successes": good, "episodes": total, "nan": nan}
+    return result
+
+
+def load_metrics(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
+    """Read metrics.jsonl; unreadable lines are not fatal.
+
+    Returns:
+      the records, and a sentence for each thing that was wrong with the file.
+    """
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            records = read_metrics(path)
+        except OSError as error:
+            raise RecordError(f"{path}: not readable ({error})") from error
+    return records, [str(warning.message) for warning in caught]

@@ -1,0 +1,537 @@
+"""`python -m palm_jax report RUN|DIR`: everything about one or more runs on one HTML page.
+
+The page is one file without scripts or outside requests: styles inline, pictures and videos as
+base64. It is built from what the run folders hold (`palm_jax.train.records`). A missing input
+leaves its part out; a damaged one is named on the page, and the rest is shown.
+
+DIR may be one run, or hold runs at any depth: methods, seeds and tasks are read from each
+`config.json`. Seeds of a method are pooled, tasks get a section each, and several tasks a table of
+their means, which is what the paper's Table I shows.
+"""
+
+import json
+import re
+import shlex
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from matplotlib.figure import Figure
+
+from palm_jax import __version__
+from palm_jax.train import figures, grids, paper, records
+from palm_jax.train.console import duration
+from palm_jax.train.metrics import write_atomic
+from palm_jax.train.page import (
+    CSS,
+    damaged_media,
+    esc,
+    listing,
+    mean_table,
+    picture,
+    result_table,
+    section,
+    tiles,
+    video,
+)
+from palm_jax.train.runs import (
+    Run,
+    find_runs,
+    grouped,
+    load_run,
+    lookup,
+    pooled,
+    pooled_episodes,
+    regions_of,
+)
+
+
+def draw(methods: Mapping[str, list[Run]], folder: Path, prefix: str) -> list[tuple[Path, str]]:
+    """Draw whatever the runs of one task allow, as PNG files in `folder`.
+
+    Returns:
+      (file, caption) in the order of the page.
+    """
+    regions = regions_of(next(iter(methods.values()))[0].config)
+    episodes = {name: pooled_episodes(runs) for name, runs in methods.items()}
+    episodes = {name: by_domain for name, by_domain in episodes.items() if by_domain}
+    counts = {name: entry for name, runs in methods.items() if (entry := pooled(runs))}
+    made: list[tuple[Path, str]] = []
+
+    def add(name: str, figure: Figure, caption: str) -> None:
+        made.append((figures.save(figure, folder / f"{prefix}{name}.png"), caption))
+
+    if counts:
+        add(
+            "domains",
+            figures.domain_bars(counts),
+            "Success per domain. Bars: this run, with Wilson 95 % intervals. Diamonds: what the "
+            "paper's Table I implies, ID · (1 − degradation).",
+        )
+    pair = [name for name in ("bc", "palm") if name in episodes] or list(episodes)[:2]
+    if pair:
+        add(
+            "samples",
+            figures.sample_distribution({name: episodes[name] for name in pair}, regions),
+            "Where each policy succeeds: one mark per scene over the object's start position "
+            "(above), and scenes per ten degrees of camera rotation (below).",
+        )
+    made += _draw_sweeps(methods, episodes, regions, folder, prefix)
+    metrics = {name: runs[0].metrics for name, runs in methods.items() if runs[0].metrics}
+    if metrics:
+        add(
+            "training",
+            figures.training_curves(metrics),
+            "Training (the first seed of each method). Faint: every record; strong: running "
+            "median.",
+        )
+    return made
+
+
+def _draw_sweeps(
+    methods: Mapping[str, list[Run]],
+    episodes: Mapping[str, Mapping[str, records.DomainRecord]],
+    regions: grids.Regions,
+    folder: Path,
+    prefix: str,
+) -> list[tuple[Path, str]]:
+    """Heatmaps and angle curves: from sweeps where there are any, else from the evaluation."""
+    sweeps = {
+        name: run.sweep for name, runs in methods.items() for run in runs[:1] if run.sweep
+    }  # the first seed: seeds may have been swept over different grids
+    if sweeps:
+        where = "from a sweep over positions and camera angles (first seed)"
+        maps = {name: grids.grid_of_sweep(sweep) for name, sweep in sweeps.items()}
+        curves = {name: grids.curve_of_sweep(sweep) for name, sweep in sweeps.items()}
+    else:
+        where = "from the scenes of the evaluation"
+        maps = {
+            name: grids.grid_of_records(chosen, regions)
+            for name, by_domain in episodes.items()
+            if (chosen := _domains(by_domain, "ID", "W"))
+        }
+        curves = {
+            name: grids.curve_of_records(chosen, regions)
+            for name, by_domain in episodes.items()
+            if (chosen := _domains(by_domain, "V"))
+        }
+    made = []
+    if maps:
+        path = figures.save(figures.heatmaps(maps, regions), folder / f"{prefix}heatmap.png")
+        made.append((path, f"Success over the object's start position, {where}."))
+    if curves and any(len(curve.angles) > 1 for curve in curves.values()):
+        path = figures.save(figures.angle_curves(curves, regions), folder / f"{prefix}angles.png")
+        made.append((path, f"Success over the camera's rotation, {where}; Wilson 95 % intervals."))
+    return made
+
+
+def _domains(
+    by_domain: Mapping[str, records.DomainRecord], *wanted: str
+) -> list[records.DomainRecord]:
+    return [record for name, record in by_domain.items() if paper.domain_key(name) in wanted]
+
+
+def _unique(values: Iterable[Any]) -> str:
+    """Distinct values in order, joined; lists and dicts as short text."""
+    seen = []
+    for value in values:
+        if value in (None, "", [], {}):
+            continue
+        if isinstance(value, Mapping):
+            text = " · ".join(f"{key} {item}" for key, item in value.items())
+        elif isinstance(value, (list, tuple)):
+            text = ", ".join(map(str, value))
+        else:
+            text = str(value)
+        if text not in seen:
+            seen.append(text)
+    return (", " if max(map(len, seen), default=0) < 20 else "  |  ").join(seen)
+
+
+def facts(runs: Sequence[Run]) -> dict[str, str]:
+    """The header: what was run, when, where and with what."""
+
+    def first(*names: str) -> str:
+        found = []
+        for run in runs:
+            values = [lookup(run.env, name) for name in names]
+            values += [lookup(run.config, name) for name in names]
+            found.append(next((value for value in values if value is not None), None))
+        return _unique(found)
+
+    walls = [_seconds(run.env) for run in runs]
+    known = [wall for wall in walls if wall is not None]
+    wall = duration(sum(known)) + (" in all" if len(known) > 1 else "") if known else ""
+    entries = {
+        "task": _unique(paper.task_label(run.task) for run in runs if run.task),
+        "methods": ", ".join(
+            paper.method_label(m) for m in paper.ordered_methods(list({run.method for run in runs}))
+        ),
+        "preset": first("preset"),
+        "seeds": first("seed"),
+        "date": first("date", "started", "time"),
+        "wall time": wall,
+        "machine": first("machine", "cpu", "platform"),
+        "devices": first("devices", "device"),
+        "versions": first("versions"),
+        "commit": first("commit", "git_sha", "git"),
+    }
+    return {name: value for name, value in entries.items() if value}
+
+
+def _seconds(env: Mapping[str, Any]) -> float | None:
+    for name in ("wall_s", "wall_time_s", "wall_seconds", "wall_time"):
+        value = lookup(env, name)
+        if isinstance(value, (int, float)):
+            return float(value)
+    return None
+
+
+def commands(runs: Sequence[Run]) -> list[str]:
+    """The commands that made the runs: as recorded, else put together from config.json."""
+    lines = []
+    for run in runs:
+        recorded = lookup(run.env, "command") or lookup(run.env, "argv")
+        if isinstance(recorded, list):
+            line = shlex.join(map(str, recorded))
+        elif isinstance(recorded, str):
+            line = recorded
+        else:
+            words = ["python", "-m", "palm_jax.train"]
+            for name in ("task", "method", "preset", "seed"):
+                value = run.config.get(name)
+                if value is not None:
+                    words += [f"--{name}", str(value)]
+            line = shlex.join(words)
+        if line not in lines:
+            lines.append(line)
+    return lines
+
+
+def variant_notes(runs: Iterable[Run]) -> list[str]:
+    """Methods that were evaluated with two initial yaws of the hand: what the other one gave."""
+    words = {"aligned": "turned with the camera", "unaligned": "not turned with the camera"}
+    notes = []
+    for run in runs:
+        others = {name: entry for name, entry in run.variants.items() if name != run.quoted}
+        for name, entry in others.items():
+            turned = [d for d in entry if "V" in d and d in paper.DOMAINS]
+            numbers = ", ".join(
+                f"{paper.domain_label(d)} {entry[d]['successes']}/{entry[d]['episodes']}"
+                f" (quoted: {run.counts[d]['successes']}/{run.counts[d]['episodes']})"
+                for d in paper.ordered_domains(turned)
+                if d in run.counts
+            )
+            notes.append(
+                f"{paper.method_label(run.method)} was evaluated with the hand's initial yaw "
+                f"turned with the camera and without, and the better is quoted "
+                f"({words.get(run.quoted, run.quoted)}). {words.get(name, name).capitalize()}: "
+                f"{numbers or 'no turned domains'}."
+            )
+    return notes
+
+
+def footnotes(runs: Sequence[Run]) -> list[str]:
+    """What a reader must know to weigh the numbers."""
+    notes = []
+    scenes = sorted({entry["episodes"] for run in runs for entry in run.counts.values()})
+    if scenes:
+        count = f"{scenes[0]}" if len(scenes) == 1 else f"{scenes[0]} to {scenes[-1]}"
+        seeds: dict[tuple[str, str], int] = {}
+        for run in runs:
+            seeds[run.task, run.method] = seeds.get((run.task, run.method), 0) + 1
+        most = max(seeds.values())
+        pooled_note = (
+            f" Up to {most} training seeds per method are pooled: the intervals cover the choice "
+            "of scenes, not the spread between seeds."
+            if most > 1
+            else " One training seed per method: the intervals cover the choice of scenes only."
+        )
+        notes.append(f"{count} scenes per domain and run; Wilson 95 % intervals.{pooled_note}")
+    bad = sum(entry["nan"] for run in runs for entry in run.counts.values())
+    total = sum(entry["episodes"] for run in runs for entry in run.counts.values())
+    if total:
+        notes.append(
+            f"{bad} of {total} episodes went non-finite (NaN); such episodes are counted, as "
+            "failures."
+        )
+    notes += variant_notes(runs)
+    notes.append(
+        "Degradation is 1 − OOD / ID with each method's own in-domain success, so a method that "
+        "is weak in-domain can degrade little. Negative values are gains. Its interval treats the "
+        "two success rates as independent."
+    )
+    notes.append(
+        "The paper's numbers are means over its four simulated tasks; a single task here need not "
+        "match them. Its OOD mean is taken over the domains that were evaluated here. "
+        "Paper successes marked ≈ are implied by its table, ID · (1 − degradation)."
+    )
+    return notes
+
+
+def differences(config: Mapping[str, Any]) -> list[str]:
+    """Where this set-up departs from the paper's, as far as config.json tells."""
+    lines = [
+        "Simulator: MuJoCo MJX with scenes, robots and a ray caster written for this package; the "
+        "paper uses RLBench (CoppeliaSim, OpenGL). Exact object ranges of the paper are not "
+        "public.",
+    ]
+    width, demos, steps = (lookup(config, name) for name in ("width", "demos", "steps"))
+    if isinstance(width, int):
+        lines.append(
+            f"Encoder: ResNet-18 of base width {width} trained from scratch; the paper's has width "
+            "64 and starts from ImageNet weights."
+            if not lookup(config, "pretrained")
+            else f"Encoder: ResNet-18 of base width {width}, pretrained; the paper's has width 64."
+        )
+    if isinstance(demos, int):
+        lines.append(f"Demonstrations: {demos}; the paper uses 200 or 300 per task.")
+    if isinstance(steps, int):
+        lines.append(
+            f"Training: {steps} steps; the paper trains for 600 epochs with batches of 64."
+        )
+    frame = lookup(config, "frame")
+    if frame is not None:
+        lines.append(
+            f"Virtual camera frame: {frame}, at the paper's focal length. The paper's has 512 "
+            "pixels, and near its border the crop window shifts, so that the TCP leaves its pixel."
+        )
+    scored = lookup(config, "select_scenes")
+    if isinstance(scored, int):
+        lines.append(
+            f"Checkpoints are chosen by in-domain success on {scored} scenes that are not among "
+            "those reported; the paper reports the best of its top three."
+        )
+    labels = lookup(config, "labels")
+    if isinstance(labels, str):
+        lines.append(f"Action labels: {labels}; the paper's are achieved next poses.")
+    return lines
+
+
+def _tables(methods: Mapping[str, list[Run]]) -> str:
+    """Tiles and table of one task, and what has no numbers yet."""
+    counts = {name: entry for name, runs in methods.items() if (entry := pooled(runs))}
+    body = tiles(counts) + result_table(counts) if counts else ""
+    unevaluated = [paper.method_label(name) for name in methods if name not in counts]
+    if unevaluated:
+        body += f'<p class="note">Not evaluated yet: {esc(", ".join(unevaluated))}.</p>'
+    return body
+
+
+def _media(path: Path, runs: Sequence[Run]) -> tuple[list[Path], list[Path]]:
+    """Pictures in the folder itself, and videos of the folder and its runs."""
+    videos = {
+        file.resolve(): file
+        for folder in [path, *(run.path for run in runs)]
+        for file in sorted((folder / "videos").glob("*"))
+        if file.suffix.lower() in (".mp4", ".gif") and not file.name.startswith(".")
+    }
+    pictures = sorted((path / "figures").glob("*.png"))
+    return [p for p in pictures if not p.name.startswith(".")], list(videos.values())
+
+
+def clip_name(stem: str) -> tuple[str, str, str]:
+    """Method, domain and rest of a file name such as "palm-crop_wv_03"; empty where not given."""
+    known = [m for m in paper.METHODS if re.match(rf"{re.escape(m)}([-_ ]|$)", stem)]
+    method = max(known, key=len, default="")
+    words = re.split(r"[-_ ]+", stem[len(method) :].strip("-_ "))
+    # The longest beginning that names a domain: "workspace_viewpoint_2" is W+V, number 2.
+    for count in range(len(words), 0, -1):
+        domain = paper.domain_key(" ".join(words[:count]))
+        if domain in paper.DOMAINS:
+            return method, domain, _spaced(words[count:])
+    return method, "", _spaced(words)
+
+
+def _spaced(words: Sequence[str]) -> str:
+    """Words with a space before a trailing number: "success1" reads "success 1"."""
+    return " ".join(re.sub(r"(?<=[a-z])(\d+)$", r" \1", word) for word in words)
+
+
+def _clip_caption(file: Path, root: Path) -> str:
+    method, domain, rest = clip_name(file.stem)
+    folder = file.parent.parent
+    if not method and folder != root:
+        method = folder.name
+    parts = [method and paper.method_label(method), domain and paper.domain_title(domain), rest]
+    return ", ".join(part for part in parts if part)
+
+
+def _videos(files: Sequence[Path], root: Path, room: float) -> tuple[str, list[str]]:
+    """Videos inline up to `room` bytes; and the names of those for which there was none."""
+    order = paper.ordered_methods(list(paper.METHODS))
+
+    def place(file: Path) -> tuple[int, int, str]:
+        method, domain, _ = clip_name(file.stem)
+        by_domain = list(paper.DOMAINS).index(domain) if domain else len(paper.DOMAINS)
+        return by_domain, order.index(method) if method else len(order), str(file)
+
+    shown, left = [], []
+    for file in sorted(files, key=place):
+        size = file.stat().st_size * 4 / 3
+        if size > room:
+            left.append(str(file.relative_to(root)))
+            continue
+        room -= size
+        shown.append(video(file, _clip_caption(file, root)))
+    return (f'<div class="videos">{"".join(shown)}</div>' if shown else ""), left
+
+
+def build(path: Path, *, max_megabytes: float = 40.0) -> str:
+    """The page for a run folder or a folder of runs; draws the figures on the way.
+
+    Args:
+      path: the folder; figures are written to path/figures.
+      max_megabytes: for the videos on the page; those beyond are named, not shown.
+
+    Raises:
+      FileNotFoundError: there is no such folder, or no run in it.
+    """
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path} is not a folder")
+    runs = [load_run(folder) for folder in find_runs(path)]
+    if not runs:
+        raise FileNotFoundError(
+            f"no run in {path}: expected config.json, eval.json, eval.npz or metrics.jsonl in it "
+            "or in folders below it"
+        )
+    problems = [problem for run in runs for problem in run.problems]
+    tasks = grouped(runs)
+    drawn: list[Path] = []
+    tables, plots = [], []
+    for task, methods in tasks.items():
+        made = draw(methods, path / "figures", f"{task}-" if len(tasks) > 1 else "")
+        drawn += [file for file, _ in made]
+        plots.append("".join(picture(file, caption) for file, caption in made))
+        tables.append(_tables(methods))
+    gallery, clips = _media_parts(path, runs, drawn, problems, max_megabytes)
+    media = [section("Videos", clips), section("What it looks like", gallery)]
+    if len(tasks) == 1:
+        sections = [section("Results", tables[0]), *media, section("Figures", plots[0])]
+    else:
+        counts = {
+            task: {name: pooled(members) for name, members in methods.items()}
+            for task, methods in tasks.items()
+        }
+        sections = [section("Mean over tasks", mean_table(counts)), *media]
+        for task, table, plot in zip(tasks, tables, plots, strict=True):
+            sections.append(section(paper.task_label(task) or "No task named", table + plot))
+    return _page(runs, tasks, sections, problems)
+
+
+# Pictures that other parts of the package leave in figures/.
+_CAPTIONS = {
+    "gallery": "What each policy sees in each domain, at the start of the domain's first scene.",
+}
+
+
+def _media_parts(
+    path: Path,
+    runs: Sequence[Run],
+    drawn: Sequence[Path],
+    problems: list[str],
+    max_megabytes: float,
+) -> tuple[str, str]:
+    """Pictures that others put into figures/, and videos; damaged ones go to `problems`."""
+    others, videos = _media(path, runs)
+    damaged = {file: why for file in others + videos if (why := damaged_media(file))}
+    problems += damaged.values()
+    extra = [file for file in others if file not in drawn and file not in damaged]
+    gallery = "".join(
+        picture(file, _CAPTIONS.get(file.stem, re.sub(r"[-_]+", " ", file.stem).capitalize()))
+        for file in extra
+    )
+    clips, left = _videos([f for f in videos if f not in damaged], path, max_megabytes * 1e6)
+    if left:
+        clips += f'<p class="note">Too large for this page: {esc(", ".join(left))}.</p>'
+    return gallery, clips
+
+
+def _leading(runs: Sequence[Run]) -> Run:
+    """The run that the page is about: PALM if it is among them."""
+    return next((run for run in runs if run.method == "palm"), runs[0])
+
+
+def _page(
+    runs: Sequence[Run],
+    tasks: Mapping[str, Mapping[str, list[Run]]],
+    sections: Sequence[str],
+    problems: Sequence[str],
+) -> str:
+    names = [paper.task_label(task) for task in tasks if task]
+    methods = paper.ordered_methods(list({run.method for run in runs}))
+    title = " · ".join(names) if names else "Results"
+    labels = [paper.method_label(name) for name in methods]
+    lead = f"{', '.join(labels)}: success in and out of the training distribution"
+    warning = ""
+    if problems:
+        warning = (
+            '<div class="warn"><b>Some inputs could not be used</b>' + listing(problems) + "</div>"
+        )
+    entries = "".join(f"<dt>{esc(k)}</dt><dd>{esc(v)}</dd>" for k, v in facts(runs).items())
+    how = f"<pre>{esc(chr(10).join(commands(runs)))}</pre>" + "".join(_raw(run) for run in runs)
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>{esc(title)} - palm_jax</title><style>{CSS}</style></head><body>"
+        f'<header><h1>{esc(title)}</h1><p class="lead">{esc(lead)}</p>'
+        f'<dl class="facts">{entries}</dl></header>{warning}<main>{"".join(sections)}'
+        + section("How to read the numbers", listing(footnotes(runs)))
+        + section("What differs from the paper", listing(differences(_leading(runs).config)))
+        + section("How to reproduce", how)
+        + f"</main><footer>palm_jax {esc(__version__)}</footer></body></html>\n"
+    )
+
+
+def _raw(run: Run) -> str:
+    if not run.config and not run.env:
+        return ""
+    content = json.dumps({"config": run.config, "env": run.env}, indent=2, sort_keys=True)
+    return (
+        f"<details><summary>configuration and environment of {esc(run.path.name)}</summary>"
+        f"<pre>{esc(content)}</pre></details>"
+    )
+
+
+def write_report(path: Path, *, out: Path | None = None, max_megabytes: float = 40.0) -> Path:
+    """Build the page and write it, whole or not at all.
+
+    Args:
+      path: a run folder, or a folder with runs in it.
+      out: the file; path/report.html if not given.
+      max_megabytes: for the videos on the page.
+
+    Returns:
+      the file written.
+    """
+    page = build(path, max_megabytes=max_megabytes)
+    return write_atomic(out or path / "report.html", page.encode("utf-8"))
+
+
+@dataclass(frozen=True)
+class Options:
+    """Build one self-contained HTML page from a run folder, or from a folder with runs in it."""
+
+    path: tyro.conf.Positional[Path]
+    """The run folder, or a folder above several."""
+    out: Path | None = None
+    """The file to write; PATH/report.html if not given."""
+    max_megabytes: float = 40.0
+    """Videos beyond this size in all are named instead of shown."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The verb `report`; returns 0, or 2 with a message if there is nothing to report on."""
+    options = tyro.cli(Options, args=argv, prog="palm-jax report")
+    try:
+        written = write_report(
+            options.path, out=options.out, max_megabytes=options.max_megabytes
+        )
+    except FileNotFoundError as error:
+        print(f"palm-jax report: {error}", file=sys.stderr)
+        return 2
+    print(f"Report: {written}")
+    return 0

@@ -1,0 +1,354 @@
+"""The main job: demonstrations, then for each method training, evaluation and pictures, then a report."""
+
+import dataclasses
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from palm_jax.align import procedural_bank
+from palm_jax.envs import physics, registry
+from palm_jax.envs.rollout import Runner
+from palm_jax.train import (
+    checkpoint,
+    demos,
+    figures,
+    films,
+    learner,
+    methods,
+    pictures,
+    records,
+    report,
+    sweep,
+    videos,
+    workspace,
+)
+from palm_jax.train import console as terminal
+from palm_jax.train.config import Config, command, default_out
+from palm_jax.train.evaluate import Evaluator, evaluate, quoted
+from palm_jax.train.metrics import MetricsLog, write_json
+
+_FILMED = "workspace+viewpoint"
+_BANK = 128  # background textures for Random Overlay
+_SELECTION_SEED = 500  # scenes that score checkpoints: never those of the evaluation
+
+
+class Interrupted(KeyboardInterrupt):
+    """Stopped on request, with everything saved."""
+
+
+class Stop:
+    """Ctrl-C and SIGTERM: the first asks for an orderly end, the second ends at once."""
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    def __call__(self) -> bool:
+        return self.asked
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """While training: a signal sets the flag, which is looked at between two steps."""
+
+        def note(number: int, frame: Any) -> None:
+            if self.asked:
+                raise KeyboardInterrupt
+            self.asked = True
+
+        before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def execute(config: Config, console: Console) -> Path:
+    """Runs a whole command; returns its folder.
+
+    Raises:
+      ConfigError: the folder holds another run.
+      DemoFileError: the demonstrations cannot be used.
+      Interrupted: stopped on request.
+    """
+    start = time.monotonic()
+    out = config.out or default_out(config)
+    config = dataclasses.replace(config, out=out)
+    folders = {name: out / name if len(config.method) > 1 else out for name in config.method}
+    for name, folder in folders.items():
+        workspace.begin(config, folder, name)
+    terminal.header(
+        console,
+        "palm_jax",
+        {
+            "task": config.task,
+            "methods": ", ".join(config.method),
+            "preset": config.preset,
+            "robot": config.robot,
+            "device": jax.devices()[0],
+            "folder": out,
+        },
+    )
+    runner = Runner(registry.make(config.task, config.robot), _worlds(config))
+    data = _demonstrations(config, runner, console)
+    for name, folder in folders.items():
+        began = time.monotonic()
+        _one_method(config, methods.find(name), runner, data, folder, console)
+        _note_environment(config, folder, time.monotonic() - began)
+    if config.sweep:
+        _sweeps(config, runner, folders, console)
+    _gallery(folders, out)
+    report.write_report(out)
+    counts = {name: records.load_counts(folder / "eval.json") for name, folder in folders.items()}
+    if len(folders) > 1:
+        write_json(out / "summary.json", counts)
+    terminal.results(console, counts)
+    console.print(f"Report: {out / 'report.html'}   ({terminal.duration(time.monotonic() - start)})")
+    return out
+
+
+def _worlds(config: Config) -> int:
+    """Worlds in a batch: a domain's scenes at once, within what a CPU takes."""
+    limit = physics.MAX_CPU_WORLDS
+    return config.scenes if config.scenes <= limit else limit // 2
+
+
+def _note_environment(config: Config, folder: Path, wall_s: float) -> None:
+    path = folder / "env.json"
+    earlier = records.load_json(path).get("wall_s", 0.0) if path.exists() else 0.0
+    write_json(path, workspace.environment(config, wall_s=earlier + wall_s))
+
+
+def _demonstrations(config: Config, runner: Runner, console: Console) -> demos.Demos:
+    assert config.out is not None
+    path = config.data or config.out / "demos" / f"{config.task}-{config.robot}.hdf5"
+    if not path.exists():
+        with terminal.ProgressBar(console, config.demos, "demonstrate", unit="demo") as bar:
+            done = 0
+
+            def progress(kept: int) -> None:
+                nonlocal done
+                bar.advance(kept - done)
+                done = kept
+
+            demos.collect(
+                runner,
+                path,
+                count=config.demos,
+                seed=config.demo_seed,
+                noise=config.demo_noise,
+                progress=progress,
+            )
+    data = demos.load(path, task=config.task, robot=config.robot, count=config.demos)
+    text = ", ".join(f"{value} {name}" for name, value in demos.summary(data).items())
+    console.print(f"Demonstrations: {text}")
+    return data
+
+
+def _one_method(
+    config: Config,
+    method: methods.Method,
+    runner: Runner,
+    data: demos.Demos,
+    folder: Path,
+    console: Console,
+) -> None:
+    if (folder / "eval.json").exists():
+        console.print(f"{method.name}: trained and evaluated already")
+        return
+    evaluator = workspace.make_evaluator(config, method, runner)
+    spec = method.spec(runner.env.task, config.image_size)
+    images, proprio = demos.render_observations(runner, data, spec, frame=method.frame)
+    batch = learner.Batch({"front": images}, proprio, data.actions)
+    _train(config, evaluator, batch, folder, console)
+    _evaluate(config, evaluator, folder, console)
+
+
+def _train(
+    config: Config, evaluator: Evaluator, data: learner.Batch, folder: Path, console: Console
+) -> None:
+    """Trains from the newest valid checkpoint, or from the start, to the last step."""
+    model, store = evaluator.learner, folder / "checkpoints"
+    state, done = None, 0
+    found = checkpoint.latest_valid(store)
+    if found:
+        done, path = found
+        state = checkpoint.load(path, model.abstract_state())
+        if done < config.steps:
+            terminal.resumed(console, f"{evaluator.method.name}, step {done} of {config.steps}")
+        _score_if_missing(config, evaluator, path, done, state)
+    bank = _backgrounds(config) if evaluator.method.augment else None
+    stop = Stop()
+    with (
+        MetricsLog(folder / "metrics.jsonl", resume_step=done) as log,
+        terminal.ProgressBar(
+            console, config.steps, f"train {evaluator.method.name}", done=done
+        ) as bar,
+        stop.listening(),
+    ):
+        shown = done
+
+        def on_log(step: int, values: dict[str, float]) -> None:
+            nonlocal shown
+            log.write(step, values)
+            bar.advance(step - shown, loss=f"{values['loss']:.4f}")
+            shown = step
+
+        def on_checkpoint(step: int, state: learner.TrainState) -> None:
+            meta = {"method": evaluator.method.name, "task": config.task}
+            path = checkpoint.save(store, step, state, meta, keep=config.keep)
+            if not stop() and (score := _score_if_missing(config, evaluator, path, step, state)):
+                log.write(step, {"in_domain_success": score})
+
+        learner.run(
+            model,
+            data,
+            seed=config.seed,
+            state=state,
+            bank=bank,
+            log_every=25,
+            on_log=on_log,
+            checkpoint_every=config.checkpoint_every,
+            on_checkpoint=on_checkpoint,
+            should_stop=stop,
+        )
+    if stop():
+        raise Interrupted
+
+
+def _score_if_missing(
+    config: Config, evaluator: Evaluator, path: Path, step: int, state: learner.TrainState
+) -> float | None:
+    """In-domain success of a checkpoint, written into its meta data; None where it is not scored."""
+    if step < config.select_from * config.steps or checkpoint.SCORE in checkpoint.read_meta(path):
+        return None
+    found = evaluator.domain(
+        evaluator.learner.policy_state(state),
+        "in_domain",
+        seed=_SELECTION_SEED,
+        count=config.select_scenes,
+        aligned=False,
+    )
+    score = float(found.solved.mean())
+    checkpoint.update_meta(path, **{checkpoint.SCORE: score})
+    return score
+
+
+def _backgrounds(config: Config) -> jax.Array:
+    """Pictures [K, H, W, 3] for Random Overlay: the user's own, or textures made in jit."""
+    if config.backgrounds is not None:
+        return jax.numpy.asarray(pictures.read_folder(config.backgrounds, config.image_size))
+    return procedural_bank(jax.random.key(config.seed), _BANK, config.image_size)
+
+
+def _evaluate(config: Config, evaluator: Evaluator, folder: Path, console: Console) -> None:
+    policy = workspace.best_policy(folder, evaluator.learner)
+    traces: dict[tuple[str, str], films.Trace] = {}
+
+    def watch(variant: str, domain: str) -> films.Trace:
+        return traces.setdefault((variant, domain), films.Trace())
+
+    label = f"evaluate {evaluator.method.name}"
+    with terminal.ProgressBar(console, len(config.domains), label, unit="domain") as bar:
+        results = evaluate(
+            evaluator,
+            policy,
+            config.domains,
+            seed=config.eval_seed,
+            scenes=config.scenes,
+            progress=bar.advance,
+            watch=watch,
+        )
+    chosen = quoted(results)
+    records.save_eval(folder / "eval.npz", results[chosen])
+    variants = {name: records.counts(domains) for name, domains in results.items()}
+    write_json(folder / "eval_variants.json", {"quoted": chosen, **variants})
+    _film(config, evaluator, {d: t for (v, d), t in traces.items() if v == chosen}, folder)
+    # Written last: its presence says that the method is finished.
+    write_json(folder / "eval.json", variants[chosen])
+
+
+def _film(
+    config: Config, evaluator: Evaluator, traces: dict[str, films.Trace], folder: Path
+) -> None:
+    """Videos of a few successes and failures, and the first view of every domain."""
+    camera, method = films.Camera(evaluator.runner), evaluator.method
+    spec = method.spec(evaluator.task, config.image_size)
+    views: dict[str, np.ndarray] = {}
+    for domain, trace in traces.items():
+        views[f"input/{domain}"], views[f"frame/{domain}"] = camera.first(
+            trace, spec, frame=method.frame
+        )
+    np.savez_compressed(folder / "views.npz", **views)  # type: ignore[arg-type]
+    trace = traces.get(_FILMED) or next(iter(traces.values()))
+    solved = np.stack(trace.solved).any(0)
+    for outcome, worlds in (("success", np.flatnonzero(solved)), ("failure", np.flatnonzero(~solved))):
+        for number, world in enumerate(worlds[: config.videos]):
+            film = camera.film(trace, int(world), spec, frame=method.frame)
+            frames = videos.episode_frames(
+                film.inputs,
+                film.frames,
+                method=method.name,
+                domain=_FILMED,
+                success=film.success,
+                task=config.task,
+            )
+            name = f"{method.name}_{_FILMED.replace('+', '_')}_{outcome}{number + 1}.mp4"
+            videos.write_video(folder / "videos" / name, frames)
+
+
+def _sweeps(
+    config: Config, runner: Runner, folders: dict[str, Path], console: Console
+) -> None:
+    """A coarse sweep of every policy; `python -m palm_jax sweep RUN` makes finer ones."""
+    options = sweep.SweepConfig(run=Path())
+    angles, (xs, ys) = sweep.angles_of(options.camera), sweep.cells_of(options.workspace)
+    for name, folder in folders.items():
+        if (folder / "sweep.npz").exists():
+            continue
+        evaluator = workspace.make_evaluator(config, methods.find(name), runner)
+        total = len(angles) * len(xs) * len(ys) * options.episodes
+        with terminal.ProgressBar(console, total, f"sweep {name}", unit="episode") as bar:
+            found = sweep.sweep(
+                evaluator,
+                workspace.best_policy(folder, evaluator.learner),
+                angles=angles,
+                xs=xs,
+                ys=ys,
+                episodes=options.episodes,
+                seed=options.seed,
+                aligned=workspace.quoted_variant(folder) == "aligned",
+                progress=bar.advance,
+            )
+        records.save_sweep(folder / "sweep.npz", found)
+
+
+def _gallery(folders: dict[str, Path], out: Path) -> None:
+    """What each method sees in each domain, on the same scenes."""
+    inputs: dict[str, dict[str, np.ndarray]] = {}
+    frames: dict[str, np.ndarray] = {}
+    for name, folder in folders.items():
+        path = folder / "views.npz"
+        if not path.exists():
+            continue
+        with np.load(path) as views:
+            split: Callable[[str], dict[str, np.ndarray]] = lambda kind: {
+                key.partition("/")[2]: views[key] for key in views.files if key.startswith(kind)
+            }
+            inputs[name], frames = split("input/"), split("frame/")
+    if inputs:
+        figures.save(figures.gallery(inputs, frames=frames), out / "figures" / "gallery.png")
+
+
+def resume_command(config: Config) -> list[str]:
+    """The command line that goes on with a run."""
+    out = config.out or default_out(config)
+    return command(dataclasses.replace(config, out=out), resume=True)
+
+
