@@ -1,9 +1,9 @@
 """The environment: `Env`, its shiftable parameters `EnvParams` and its `State`.
 
-An episode: objects are placed in a region, a global policy finds the target in a rendered mask and the
-hand is put near it (`reset`), then a local policy moves the TCP by body-frame deltas (`step`). All
-functions are pure, for one world; batch them with `jax.vmap`. Everything that can shift is a leaf of
-`EnvParams`, so a sweep is a `vmap` over params.
+An episode: objects are placed in a region, a global policy finds the target in a rendered mask and
+the hand is put near it (`reset`), then a local policy moves the TCP by body-frame deltas (`step`).
+All functions are pure, for one world; batch them with `jax.vmap`. Everything that can shift is a
+leaf of `EnvParams`, so a sweep is a `vmap` over params.
 """
 
 import dataclasses
@@ -51,11 +51,11 @@ class EnvParams:
 
     camera_to_world: jax.Array  # [4, 4] nominal camera pose (OpenCV axes)
     camera_fovy: jax.Array  # [] degrees, of the 512-pixel frame
-    camera_angle: jax.Array  # [2] range of the camera's turn about the workspace's vertical, radians
+    camera_angle: jax.Array  # [2] range of the camera's turn about the workspace centre, radians
     object_low: jax.Array  # [2] lower xy corner of the target object's region, metres
     object_high: jax.Array  # [2] upper corner
     object_yaw: jax.Array  # [2] range of the object's yaw in the world, radians
-    start_radius: jax.Array  # [] the hand starts within this of the located target, per axis, metres
+    start_radius: jax.Array  # [] the hand starts this near the located target, per axis, metres
     start_height: jax.Array  # [2] range of the TCP's height above the table, metres
     start_yaw: jax.Array  # [2] range of the hand's yaw, radians
     align_hand: jax.Array  # [] 1: the hand's initial yaw turns with the camera, 0: it does not
@@ -90,8 +90,9 @@ def _uniform(key: jax.Array, bounds: jax.Array) -> jax.Array:
 class Env:
     """A task on a robot.
 
-    Actions are [10]: the body-frame delta of the TCP (6D rotation, then xyz in metres), then the gripper
-    (1 open, 0 close); 20 actions a second. `step` executes `tcp @ delta` from the measured TCP pose.
+    Actions are [10]: the body-frame delta of the TCP (6D rotation, then xyz in metres), then the
+    gripper (1 open, 0 close); 20 actions a second. `step` executes `tcp @ delta` from the measured
+    TCP pose.
 
     Attributes:
       task: what is to be done.
@@ -124,7 +125,7 @@ class Env:
         return np.array([int(self.mj_model.joint(name).qposadr[0]) for name in joints])
 
     def default_params(self) -> EnvParams:
-        """The training distribution: the paper's front camera, a 0.2 x 0.2 m region of the table."""
+        """The training distribution: the paper's front camera, objects within 0.2 x 0.2 m."""
         centre = np.asarray(WORKSPACE_CENTRE[:2])
         lights = self.scene_model.lights
         values = {
@@ -168,11 +169,13 @@ class Env:
             mocap_quat=placement.mocap_quat,
         )
         data = mjx.kinematics(self.mjx_model, data)
-        camera = Camera.from_fovy(params.camera_fovy, PAPER_FRAME, PAPER_FRAME, params.camera_to_world)
+        camera = Camera.from_fovy(
+            params.camera_fovy, PAPER_FRAME, PAPER_FRAME, params.camera_to_world
+        )
         turned = camera.rotated_about(jnp.asarray(WORKSPACE_CENTRE), angle)
         return State(
             data=data,
-            camera_to_world=turned.cam_to_world,
+            camera_to_world=jnp.asarray(turned.cam_to_world),
             camera_angle=angle,
             object_start=self.task.object_position(self._ids, data),
             object_yaw=yaw,
@@ -191,7 +194,7 @@ class Env:
         camera_to_world: jax.Array,
         params: EnvParams,
     ) -> State:
-        """A state to look at, from a recorded one: poses agree with `qpos` [nq], velocities are zero.
+        """A state to look at, from a recorded one: poses agree with `qpos`, nothing moves.
 
         Args:
           qpos: [nq]. mocap_pos: [nmocap, 3]. mocap_quat: [nmocap, 4]. camera_to_world: [4, 4].
@@ -208,11 +211,13 @@ class Env:
     def locate(self, state: State, params: EnvParams) -> State:
         """The analytic global policy, first half: the target's xy from its rendered mask.
 
-        The centroid of the mask is carried along its ray to the object's centre height (paper, section
-        III-D). A target that is not in the mask leaves the workspace centre and `seen = False`.
+        The centroid of the mask is carried along its ray to the object's centre height (paper,
+        section III-D). A target that is not in the mask leaves the workspace centre and `seen =
+        False`.
         """
         camera = self.camera(state, params, frame=WIDE_FRAME).scaled(_LOCATE_SIZE / WIDE_FRAME)
         frame = render(self.scene(state, params), camera, outputs=("segmentation",))
+        assert frame.segmentation is not None
         mask = jnp.isin(frame.segmentation, jnp.asarray(self._target_ids)).astype(jnp.float32)
         count = mask.sum()
         centre = jnp.arange(_LOCATE_SIZE) + 0.5
@@ -268,7 +273,10 @@ class Env:
 
     def tcp(self, state: State) -> jax.Array:
         """Pose [4, 4] of the TCP in the world."""
-        rotation, position = state.data.site_xmat[self._tcp_site], state.data.site_xpos[self._tcp_site]
+        rotation, position = (
+            state.data.site_xmat[self._tcp_site],
+            state.data.site_xpos[self._tcp_site],
+        )
         return jnp.eye(4).at[:3, :3].set(rotation.reshape(3, 3)).at[:3, 3].set(position)
 
     def opening(self, state: State) -> jax.Array:
@@ -281,7 +289,7 @@ class Env:
         return self.task.object_position(self._ids, state.data)
 
     def camera(self, state: State, params: EnvParams, *, frame: int = WIDE_FRAME) -> Camera:
-        """This episode's camera with a square image of `frame` pixels and the paper's focal length."""
+        """This episode's camera: a square image of `frame` pixels, the paper's focal length."""
         paper = Camera.from_fovy(
             params.camera_fovy, PAPER_FRAME, PAPER_FRAME, state.camera_to_world
         )
@@ -306,18 +314,19 @@ class Env:
     ) -> Aligned:
         """What a policy sees: the aligned image [size, size, 3] uint8 and proprioception.
 
-        Only the pixels of the policy's window are rendered, at the policy's resolution. `frame` is the
-        side of the virtual full image that a `border="shift"` window must stay inside.
+        Only the pixels of the policy's window are rendered, at the policy's resolution. `frame` is
+        the side of the virtual full image that a `border="shift"` window must stay inside.
         """
         view = spec.view_camera(self.camera(state, params, frame=frame))
         tcp = self.tcp(state)
         origin, _ = window_origin(view, tcp, spec)
         window = Window(origin, spec.size, spec.size)
         image = render(self.scene(state, params), view, window).rgb
+        assert image is not None
         return align_window(image, view, origin, tcp, self.opening(state), spec)
 
     def render(self, state: State, params: EnvParams, size: int, **options: Any) -> Frame:
-        """The paper's full frame at `size` x `size` pixels; options as in `palm_jax.render.render`."""
+        """The paper's full frame at `size` x `size` pixels; options as in `palm_jax.render`."""
         camera = self.camera(state, params, frame=PAPER_FRAME).scaled(size / PAPER_FRAME)
         return render(self.scene(state, params), camera, **options)
 
@@ -334,11 +343,10 @@ class Env:
 
 
 def front_camera() -> np.ndarray:
-    """Pose [4, 4] of RLBench's front camera in OpenCV axes (looks at the robot, pitched 25 deg down)."""
+    """Pose [4, 4] of RLBench's front camera (OpenCV axes): facing the robot, 25 degrees down."""
     sin, cos = np.sin(np.radians(25.0)), np.cos(np.radians(25.0))
     right, down, forward = (0.0, 1.0, 0.0), (sin, 0.0, -cos), (-cos, 0.0, -sin)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, down, forward], -1)
     pose[:3, 3] = (1.35, 0.0, 1.58)
     return pose
-

@@ -1,7 +1,8 @@
 """Body-frame TCP deltas to joint targets: forward kinematics and damped least squares.
 
-The arm is a chain of hinges about each link's z axis, read once from the MuJoCo model. Poses are 4x4
-matrices in the world frame; the TCP frame has z along the approach and y along the opening axis.
+The arm is a chain of hinges about each link's z axis, read once from the MuJoCo model. Poses are
+4x4 matrices in the world frame; the TCP frame has z along the approach and y along the opening
+axis.
 """
 
 import dataclasses
@@ -144,7 +145,7 @@ def reach(chain: Chain, qpos: jax.Array, target: jax.Array) -> jax.Array:
 
 
 def pointing_down(position: jax.Array, yaw: jax.Array) -> jax.Array:
-    """TCP pose [4, 4] at `position` [3], approach straight down, x axis at `yaw` [] from world x."""
+    """TCP pose [4, 4] at `position` [3], approaching straight down, x axis at `yaw` []."""
     cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros(())
     rotation = jnp.stack([cos, sin, zero, sin, -cos, zero, zero, zero, zero - 1.0]).reshape(3, 3)
     return jnp.eye(4).at[:3, :3].set(rotation).at[:3, 3].set(position)
@@ -158,7 +159,8 @@ def step_towards(
     max_distance: float = 0.010,
     max_angle: float = 0.07,
 ) -> jax.Array:
-    """Next pose [4, 4] on the way from `tcp` to `target`, both [4, 4]: a saturated proportional step.
+    """Next pose [4, 4] on the way from `tcp` to `target`, both [4, 4]: a saturated proportional
+    step.
 
     Args:
       gain: share of the remaining error covered in one control step.

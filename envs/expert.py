@@ -14,6 +14,9 @@ NOISE = 0.004
 """Default standard deviation (metres) of the disturbance of each commanded translation."""
 
 _CORRELATION = 0.8  # of the disturbance from one control step to the next: it pushes, not trembles
+_HELD_SHARE = (
+    0.3  # of the sideways disturbance once the gripper closes: a lift should stay straight
+)
 _YAW_NOISE = 4.0  # radians of disturbance per metre: 4 mm go with about 1 degree
 
 
@@ -37,20 +40,30 @@ class Recording(NamedTuple):
     success: np.ndarray  # bool [W]
 
 
+class _Command(NamedTuple):
+    """What the expert wants in W worlds, and what is executed."""
+
+    action: jax.Array  # [W, 10] the clean command: the label
+    executed: jax.Array  # [W, 10]
+    push: jax.Array  # [W, 4] disturbance: metres in x, y, z; metres that stand for yaw
+    tcp: jax.Array  # [W, 4, 4]
+    opening: jax.Array  # [W]
+
+
 class Demonstrator:
     """The perturbed expert on W worlds, compiled once."""
 
     def __init__(self, runner: Runner) -> None:
         self.runner = runner
-        self._advance = physics.jit_physics(jax.vmap(self._step, in_axes=(0, 0, 0, 0, None)))
+        self._command = physics.jit_physics(jax.vmap(self._one_command, in_axes=(0, 0, 0, None)))
 
     def __call__(
         self, key: jax.Array, keys: jax.Array, params: EnvParams, *, noise: float = NOISE
     ) -> Recording:
         """Runs one episode in every world.
 
-        The executed translation is the command plus a disturbance that is correlated in time, so that
-        states off the expert's path are visited and labelled with the way back.
+        The executed translation is the command plus a disturbance that is correlated in time, so
+        that states off the expert's path are visited and labelled with the way back.
 
         Args:
           key: randomness of the disturbance.
@@ -63,40 +76,45 @@ class Demonstrator:
         push, frames = jnp.zeros((worlds, 4)), []
         for t in range(horizon):
             step_keys = jax.random.split(jax.random.fold_in(key, t), worlds)
-            state, push, frame = self._advance(step_keys, state, push, params, jnp.float32(noise))
+            command = self._command(step_keys, state, push, jnp.float32(noise))
+            before, push = state, command.push
+            state = self.runner.step(state, command.executed, params)
+            frame = Frames(
+                qpos=before.data.qpos,
+                qvel=before.data.qvel,
+                tcp=command.tcp,
+                opening=command.opening,
+                action=command.action,
+                success=state.success,
+            )
             frames.append(jax.tree.map(np.asarray, frame))
             if np.all(frames[-1].success | np.asarray(state.nan)):
                 break
-        stacked = Frames(*(np.stack(field) for field in zip(*frames, strict=True)))
+        stacked: Frames = jax.tree.map(lambda *steps: np.stack(steps), *frames)
         solved = np.asarray(stacked.success)
         length = np.where(solved.any(0), solved.argmax(0) + 1, len(frames))
         return Recording(stacked, start, length, solved.any(0) & ~np.asarray(state.nan))
 
-    def _step(
-        self, key: jax.Array, state: State, push: jax.Array, params: EnvParams, noise: jax.Array
-    ) -> tuple[State, jax.Array, Frames]:
+    def _one_command(
+        self, key: jax.Array, state: State, push: jax.Array, noise: jax.Array
+    ) -> "_Command":
         env = self.runner.env
         action = env.expert(state)
         fresh = jax.random.normal(key, (4,)) * noise
         push = _CORRELATION * push + jnp.sqrt(1 - _CORRELATION**2) * fresh
-        after = env.step(state, disturbed(action, push), params)
-        frame = Frames(
-            qpos=state.data.qpos,
-            qvel=state.data.qvel,
-            tcp=env.tcp(state),
-            opening=env.opening(state),
-            action=action,
-            success=after.success,
-        )
-        return after, push, frame
+        sideways = jnp.where(action[9] > 0.5, 1.0, _HELD_SHARE)
+        scaled = jnp.where(jnp.array([True, True, False, True]), sideways, 1.0) * push
+        return _Command(action, disturbed(action, scaled), push, env.tcp(state), env.opening(state))
 
 
 def disturbed(action: jax.Array, push: jax.Array) -> jax.Array:
-    """`action` [10] with its translation moved by `push[:3]` and its yaw by 4 rad/m of `push[3]`."""
+    """`action` [10], its translation moved by `push[:3]`, its yaw by 4 rad/m of `push[3]`."""
     angle = _YAW_NOISE * push[3]
     cos, sin = jnp.cos(angle), jnp.sin(angle)
-    turn = jnp.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]]).at[:2, :2].set(
-        jnp.stack([cos, -sin, sin, cos]).reshape(2, 2)
+    turn = (
+        jnp.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
+        .at[:2, :2]
+        .set(jnp.stack([cos, -sin, sin, cos]).reshape(2, 2))
     )
     columns = turn @ jnp.stack([action[:3], action[3:6]], -1)
     return jnp.concatenate([columns[:, 0], columns[:, 1], action[6:9] + push[:3], action[9:]])

@@ -3,9 +3,10 @@
 Two facts of XLA's CPU backend shape this file (figures in docs/performance.md):
 
 * its default fusion emitters make MJX about a thousand times slower, so physics is compiled with
-  `compiler_options()` of its own; the renderer and the networks want the default, so they live in other
-  jits (`jit_physics` is for physics alone);
-* inside `lax.scan`, fusions recompute kinematics across MJX's stages unless an `optimization_barrier`
+  `compiler_options()` of its own; the renderer and the networks want the default, so they live in
+  other jits (`jit_physics` is for physics alone);
+* inside `lax.scan`, fusions recompute kinematics across MJX's stages unless an
+`optimization_barrier`
   stands between them.
 """
 
@@ -58,8 +59,8 @@ def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def substeps(model: mjx.Model, data: mjx.Data, count: int) -> mjx.Data:
     """`count` physics steps with constant controls, then kinematics at the final `qpos`.
 
-    MuJoCo's step leaves body poses one step behind `qpos`; the final kinematics make what is rendered
-    and observed agree with the stored state.
+    MuJoCo's step leaves body poses one step behind `qpos`; the final kinematics make what is
+    rendered and observed agree with the stored state.
     """
     data, _ = jax.lax.scan(lambda d, _: (step(model, d), None), data, None, length=count)
     return mjx.kinematics(model, data)

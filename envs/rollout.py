@@ -1,8 +1,9 @@
 """Episodes in bulk.
 
-Two executions of the same episode. `Runner` keeps physics, rendering and the policy in separate jits, each
-with the compiler options it wants: the fast way on CPUs. `scan_episodes` is one `lax.scan` over everything,
-for accelerators, where one program avoids the host. Both give the same episodes up to rounding.
+Two executions of the same episode. `Runner` keeps physics, rendering and the policy in separate
+jits, each with the compiler options it wants: the fast way on CPUs. `scan_episodes` is one
+`lax.scan` over everything, for accelerators, where one program avoids the host. Both give the same
+episodes up to rounding.
 """
 
 from collections.abc import Callable
@@ -47,14 +48,16 @@ def _outcome(state: State, length: jax.Array) -> Episodes:
 class Runner:
     """The compiled pieces of an environment for a fixed number of worlds.
 
-    Every function is batched over [W] worlds: keys [W], states and params with a leading [W]. One `Runner`
-    compiles once and serves demonstrations, selection and evaluation alike.
+    Every function is batched over [W] worlds: keys [W], states and params with a leading [W]. One
+    `Runner` compiles once and serves demonstrations, selection and evaluation alike.
     """
 
     def __init__(self, env: Env, worlds: int) -> None:
         limit = physics.MAX_CPU_WORLDS
         if not 0 < worlds <= limit and jax.default_backend() == "cpu":
-            raise ValueError(f"expected 1 to {limit} worlds a batch on CPU, got {worlds}: use chunks")
+            raise ValueError(
+                f"expected 1 to {limit} worlds a batch on CPU, got {worlds}: use chunks"
+            )
         self.env = env
         self.worlds = worlds
         self.step = physics.jit_physics(jax.vmap(env.step))
@@ -160,3 +163,8 @@ def scan_episodes(
 def repeat_params(params: EnvParams, count: int) -> EnvParams:
     """`params` of one world with a leading axis [count]."""
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), params)
+
+
+def take_params(params: EnvParams, rows: np.ndarray) -> EnvParams:
+    """The worlds `rows` [n] of params with a leading axis."""
+    return jax.tree.map(lambda leaf: leaf[rows], params)

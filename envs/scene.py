@@ -14,7 +14,7 @@ _TEXTURES = {"table_top": ("wood", 0.09), "floor": ("checker", 0.35)}
 
 _MATTE, _GLOSSY = (0.06, 0.2), (0.35, 0.5)  # specular, shininess
 _VISIBLE_GROUPS = (0, 1, 2)  # MuJoCo's own default; collision geoms live in group 3
-_BACKGROUND = ((0.80, 0.84, 0.88), (0.60, 0.68, 0.78))
+_BACKGROUND = np.array([[0.80, 0.84, 0.88], [0.60, 0.68, 0.78]], np.float32)
 
 
 class LightDefaults(NamedTuple):

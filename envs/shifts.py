@@ -1,7 +1,7 @@
 """Distribution shifts: pure functions `EnvParams -> EnvParams`, and the domains made of them.
 
-A shift widens what an episode is drawn from; `strength` scales it (1 is the paper's, 0 none). Sweeps that
-want one fixed value set equal bounds instead (`at_camera_angle`, `at_object`).
+A shift widens what an episode is drawn from; `strength` scales it (1 is the paper's, 0 none).
+Sweeps that want one fixed value set equal bounds instead (`at_camera_angle`, `at_object`).
 """
 
 import dataclasses
@@ -21,14 +21,14 @@ MAX_CAMERA_ANGLE = float(np.radians(30.0))
 
 
 def workspace(params: EnvParams, *, strength: float = 1.0) -> EnvParams:
-    """The target anywhere in the test region: 0.4 x 0.7 m, seven times the training region's area."""
+    """The target anywhere in the test region: seven times the training region's area."""
     low = params.object_low + strength * (TEST_LOW - params.object_low)
     high = params.object_high + strength * (TEST_HIGH - params.object_high)
     return dataclasses.replace(params, object_low=low, object_high=high)
 
 
 def viewpoint(params: EnvParams, *, strength: float = 1.0) -> EnvParams:
-    """The camera turned by up to 30 degrees either way about the workspace centre's vertical axis."""
+    """The camera turned by up to 30 degrees either way about the workspace centre."""
     bound = jnp.asarray(strength * MAX_CAMERA_ANGLE, jnp.float32)
     return dataclasses.replace(params, camera_angle=jnp.stack([-bound, bound]))
 

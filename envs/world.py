@@ -1,7 +1,7 @@
 """Builds the MuJoCo model of a task on a robot: table + robot + task objects + contact pairs.
 
-Nothing collides by default (`contype = conaffinity = 0` everywhere); every contact that can matter is an
-explicit pair. MJX evaluates every candidate on every step, so the list is what physics costs.
+Nothing collides by default (`contype = conaffinity = 0` everywhere); every contact that can matter
+is an explicit pair. MJX evaluates every candidate on every step, so the list is what physics costs.
 """
 
 import importlib.resources
@@ -27,7 +27,7 @@ def asset_path(*parts: str) -> pathlib.Path:
 
 
 def build_spec(robot: Robot, task_asset: str, contacts: tuple[Contact, ...]) -> mujoco.MjSpec:
-    """The world of one task on one robot, ready to `compile()`; `to_xml()` then gives it as one file.
+    """The world of one task on one robot, ready to `compile()` (then `to_xml()` has all).
 
     Args:
       robot: row of `ROBOTS`.

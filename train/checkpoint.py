@@ -77,18 +77,16 @@ def _named_leaves(tree: Any) -> dict[str, Any]:
         name = jax.tree_util.keystr(path, simple=True, separator="/")
         if name in named or not all(name.split("/")):
             raise ValueError(f"cannot store a leaf under the name {name!r}: empty or not unique")
+        if jnp.issubdtype(getattr(leaf, "dtype", np.float32), jax.dtypes.prng_key):
+            raise ValueError(f"leaf {name!r} is a typed key: store its jax.random.key_data")
         named[name] = leaf
     if not named:
         raise ValueError("nothing to save or to load: the tree has no leaves")
     return named
 
 
-def _is_key(leaf: Any) -> bool:
-    return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
 def _describe(leaf: Any) -> dict[str, Any]:
-    """Shape and dtype as the manifest has them; the dtype of a typed key names its algorithm."""
+    """Shape and dtype as the manifest has them."""
     if not hasattr(leaf, "dtype"):
         leaf = np.asarray(leaf)
     return {"dtype": str(leaf.dtype), "shape": [int(n) for n in leaf.shape]}
@@ -126,7 +124,7 @@ def save(
       directory: the folder of checkpoints; made if absent. A checkpoint of the same step in it is
         replaced.
       step: 0 or more.
-      tree: any pytree of arrays, numbers and typed keys, gathered to the host.
+      tree: any pytree of arrays and numbers; they are gathered to the host.
       meta: whatever JSON can hold, returned by `read_meta`; `score` decides what is kept.
       keep: if given, `prune(directory, keep=keep)` afterwards.
 
@@ -167,10 +165,7 @@ def save(
 
 
 def _write_arrays(path: Path, named: Mapping[str, Any]) -> None:
-    host = {
-        name: np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
-        for name, leaf in named.items()
-    }
+    host = {name: np.asarray(leaf) for name, leaf in named.items()}
     # Orbax refuses arrays without elements; the manifest's shape and dtype say all about them.
     ocp.save(path, _nested({name: array for name, array in host.items() if array.size}))
 
@@ -355,8 +350,7 @@ def load(path: str | Path, target: Any) -> Any:
     Args:
       path: a checkpoint's folder. It is verified first.
       target: a pytree of arrays or `jax.ShapeDtypeStruct`s (as from `jax.eval_shape`), with exactly
-        the leaves that were saved. A subtree that was saved inside a larger one can be read with
-        `load_part`.
+        the leaves that were saved.
 
     Returns:
       the tree; leaves are NumPy arrays where the target's are, else JAX arrays with the sharding
@@ -367,27 +361,7 @@ def load(path: str | Path, target: Any) -> Any:
       CheckpointMismatch: a leaf's name, shape or dtype differs; nothing is ever cast.
     """
     path = Path(path)
-    return _load(path, target, verify(path))
-
-
-def load_part(path: str | Path, target: Mapping[str, Any]) -> dict[str, Any]:
-    """Like `load`, for some of the entries at the top of the saved tree.
-
-    `load_part(path, {"params": p, "batch_stats": s})` reads a policy out of a training state
-    without knowing the optimiser's.
-    """
-    path = Path(path)
     manifest = verify(path)
-    wanted = tuple(f"{name}/" for name in target)
-    leaves = {
-        name: leaf
-        for name, leaf in manifest["leaves"].items()
-        if name.startswith(wanted) or name in target
-    }
-    return _load(path, dict(target), {**manifest, "leaves": leaves})
-
-
-def _load(path: Path, target: Any, manifest: dict[str, Any]) -> Any:
     named = _named_leaves(target)
     _compare(path, manifest["leaves"], {name: _describe(leaf) for name, leaf in named.items()})
     arrays = _read_arrays(path / ARRAYS)
@@ -427,9 +401,7 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def _restore(value: np.ndarray, like: Any) -> Any:
-    if _is_key(like):
-        value = jax.random.wrap_key_data(jnp.array(value), impl=str(jax.random.key_impl(like)))
-    elif not isinstance(like, (jax.Array, jax.ShapeDtypeStruct)):
+    if not isinstance(like, (jax.Array, jax.ShapeDtypeStruct)):
         return value
     array = jnp.array(value)  # a copy: a JAX array that shares NumPy's memory cannot be donated
     sharding = getattr(like, "sharding", None)
@@ -460,7 +432,7 @@ def best(directory: str | Path, *, count: int = 1, score: str = SCORE) -> list[t
 
     Those without a finite score are never among them.
     """
-    ranked = []
+    ranked: list[tuple[int, Path]] = []
     for step, path in _ranked(Path(directory), score):
         if len(ranked) == count:
             break

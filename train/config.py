@@ -1,8 +1,8 @@
-"""What a training command is told: one frozen dataclass, filled by a preset and the command line."""
+"""What a training command is told: a frozen dataclass, a preset and the command line."""
 
 import dataclasses
 import difflib
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 import tyro
@@ -45,6 +45,7 @@ class Config:
       weight_decay: decoupled; 0 for none.
       ema: decay of the averaged parameters that act; 0 for none.
       overlay_warmup: updates before Random Overlay starts.
+      perspective: distortion of the random perspective; the paper's is 0.2.
       backgrounds: a folder of your own images for Random Overlay; procedural textures by default.
       checkpoint_every: updates between checkpoints; each is scored in-domain from `select_from` on.
       select_from: share of the training after which checkpoints are scored.
@@ -80,6 +81,7 @@ class Config:
     weight_decay: float = 0.0
     ema: float = 0.99
     overlay_warmup: int = 200
+    perspective: float = 0.1
     backgrounds: Path | None = None
     checkpoint_every: int = 400
     select_from: float = 0.6
@@ -106,6 +108,7 @@ class Config:
             ema=self.ema,
             overlay_fraction=0.5 if method.augment else 0.0,
             overlay_warmup_steps=self.overlay_warmup,
+            perspective_distortion=self.perspective,
             perspective_probability=0.5 if method.augment else 0.0,
         )
 
@@ -131,7 +134,7 @@ class Config:
             self.learner(methods.find(method))
 
 
-def _known(what: str, names: Sequence[str], known: Sequence[str] | dict[str, object]) -> None:  # type: ignore[type-arg]
+def _known(what: str, names: Iterable[str], known: Collection[str]) -> None:
     for name in names:
         if name not in known:
             near = difflib.get_close_matches(name, list(known), n=1)
@@ -145,7 +148,7 @@ def quick() -> Config:
 
 
 def cpu() -> Config:
-    """`python -m palm_jax.train --preset cpu --task lift_spam`: 50 scenes a domain, about 10 minutes a policy."""
+    """`python -m palm_jax.train --preset cpu --task lift_spam`: 50 scenes a domain."""
     return dataclasses.replace(
         Config(),
         preset="cpu",
@@ -161,8 +164,8 @@ def cpu() -> Config:
 def paper() -> Config:
     """`python -m palm_jax.train --preset paper`: the paper's network and schedule; wants a GPU.
 
-    Width 64 from scratch (no ImageNet weights are shipped, so the encoder's rate is not scaled down),
-    batch norm, Adam 1e-4 without schedule, batch 64, 600 epochs of about 10 000 frames.
+    Width 64 from scratch (no ImageNet weights are shipped, so the encoder's rate is not scaled
+    down), batch norm, Adam 1e-4 without schedule, batch 64, 600 epochs of about 10 000 frames.
     """
     return dataclasses.replace(
         Config(),
@@ -180,6 +183,7 @@ def paper() -> Config:
         select_scenes=50,
         scenes=50,
         overlay_warmup=1_600,
+        perspective=0.2,
     )
 
 
@@ -242,5 +246,3 @@ def command(config: Config, *, resume: bool = False) -> list[str]:
         else:
             words += [flag, str(value)]
     return [*words, "--resume"] if resume else words
-
-

@@ -1,9 +1,10 @@
 """Demonstrations: a robomimic-style HDF5 file of states, and the images rendered from it on demand.
 
-Layout: `data/demo_i/{states, actions, obs/{tcp, opening, qpos, qvel}, env_params/*}`. `states` rows are
-time, qpos, qvel as in robomimic; a demo's attributes hold `num_samples`, `model_file` (MJCF), `camera_info`
-(JSON: intrinsics and camera-to-world extrinsics of the 512-pixel front image, OpenCV axes), its seed and the
-mocap poses. `data` has `total`, `env_args` (JSON) and the provenance. No pixels: they depend on the method.
+Layout: `data/demo_i/{states, actions, obs/{tcp, opening, qpos, qvel}, env_params/*}`. `states`
+rows are time, qpos, qvel as in robomimic; a demo's attributes hold `num_samples`, `model_file`
+(MJCF), `camera_info` (JSON: intrinsics and camera-to-world extrinsics of the 512-pixel front
+image, OpenCV axes), its seed and the mocap poses. `data` has `total`, `env_args` (JSON) and the
+provenance. No pixels: they depend on the method.
 """
 
 import dataclasses
@@ -21,7 +22,7 @@ import numpy as np
 from palm_jax.align import AlignSpec
 from palm_jax.envs.base import PAPER_FRAME, Env, EnvParams
 from palm_jax.envs.expert import Demonstrator, Recording
-from palm_jax.envs.rollout import Runner, repeat_params
+from palm_jax.envs.rollout import Runner, repeat_params, take_params
 
 FORMAT = "palm_jax-demos"
 VERSION = 1
@@ -75,7 +76,9 @@ def collect(
       RuntimeError: the expert fails so often that `count` is out of reach.
     """
     if path.exists():
-        raise FileExistsError(f"{path} exists and is not overwritten: move it, or choose another name")
+        raise FileExistsError(
+            f"{path} exists and is not overwritten: move it, or choose another name"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     demonstrator = Demonstrator(runner)
     params = repeat_params(runner.env.default_params(), runner.worlds)
@@ -91,7 +94,9 @@ def collect(
                 recording = demonstrator(key, keys, params, noise=noise)
                 for world in np.flatnonzero(recording.success)[: count - kept]:
                     attempts_now = attempts + int(world) + 1
-                    _write_demo(data, kept, runner.env, recording, int(world), params, (seed, batch))
+                    _write_demo(
+                        data, kept, runner.env, recording, int(world), params, (seed, batch)
+                    )
                     kept += 1
                 attempts = attempts_now if kept == count else attempts + runner.worlds
                 if progress:
@@ -250,7 +255,7 @@ def render_observations(
     for first in range(0, total, worlds):
         rows = np.minimum(np.arange(first, first + worlds), total - 1)
         episode = demos.episode[rows]
-        params = jax.tree.map(lambda x, e=episode: x[e], demos.params)
+        params = take_params(demos.params, episode)
         state = runner.restore(
             jnp.asarray(demos.qpos[rows]),
             jnp.asarray(demos.mocap_pos[episode], jnp.float32),

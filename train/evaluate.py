@@ -9,7 +9,7 @@ import numpy as np
 
 from palm_jax.envs import shifts
 from palm_jax.envs.base import EnvParams, State
-from palm_jax.envs.rollout import Act, Episodes, Runner, repeat_params
+from palm_jax.envs.rollout import Act, Episodes, Runner, repeat_params, take_params
 from palm_jax.envs.tasks import Task
 from palm_jax.train.learner import Learner, PolicyState
 from palm_jax.train.methods import Method
@@ -62,7 +62,7 @@ class Evaluator:
         for first in range(0, count, worlds):
             rows = np.arange(first, first + worlds)
             keys = jax.vmap(lambda i: jax.random.fold_in(scenes, i))(rows)
-            batch = jax.tree.map(lambda x, r=np.minimum(rows, count - 1): x[r], params)
+            batch = take_params(params, np.minimum(rows, count - 1))
             noise = jax.random.fold_in(scenes, 2**31 + first)
             parts.append(
                 self.runner.run(
@@ -75,7 +75,7 @@ class Evaluator:
                     watch=watch if first == 0 else None,
                 )
             )
-        return Episodes(*(np.concatenate(field)[:count] for field in zip(*parts, strict=True)))
+        return jax.tree.map(lambda *fields: np.concatenate(fields)[:count], *parts)
 
     def domain(
         self,
@@ -134,8 +134,8 @@ def evaluate(
       watch: (variant, domain) -> what is to be shown the states of its first batch, if anything.
 
     Returns:
-      variant ("aligned", "unaligned") -> domain -> episodes. Domains without a turned camera are the
-      same in both and are run once.
+      variant ("aligned", "unaligned") -> domain -> episodes. Domains without a turned camera are
+      the same in both and are run once.
     """
     variants = ("aligned",) if evaluator.method.hand == "aligned" else ("unaligned", "aligned")
     results: dict[str, dict[str, DomainRecord]] = {variant: {} for variant in variants}

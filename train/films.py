@@ -57,7 +57,9 @@ class Camera:
         length = trace.length(world)
         inputs, frames = [], []
         for state, params, count in self._states(trace, world, length):
-            inputs.append(np.asarray(self.runner.observe(state, params, spec, frame=frame).image)[:count])
+            inputs.append(
+                np.asarray(self.runner.observe(state, params, spec, frame=frame).image)[:count]
+            )
             frames.append(np.asarray(self._full(state, params))[:count])
         solved = bool(np.stack(trace.solved)[:, world].any())
         return Film(np.concatenate(inputs), np.concatenate(frames), solved)

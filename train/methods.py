@@ -1,4 +1,4 @@
-"""One table of methods. A method is what the policy sees, and how its training images are augmented."""
+"""One table of methods: what a policy sees, and how its training images are augmented."""
 
 import dataclasses
 
@@ -19,8 +19,9 @@ class Method:
       overlay: whether the TCP axes are drawn.
       augment: whether Random Overlay and perspective run in training.
       frame: side in pixels of the virtual full image that a crop is clamped to.
-      hand: evaluations under a turned camera: "aligned" (the hand's initial yaw turns with the camera,
-        as in the authors' code for PALM), or "both": with and without, the better one quoted.
+      hand: evaluations under a turned camera: "aligned" (the hand's initial yaw turns with the
+        camera, as in the authors' code for PALM), or "both": with and without, the better one
+        quoted.
     """
 
     name: str
@@ -89,5 +90,3 @@ def find(name: str) -> Method:
     if name not in METHODS:
         raise ValueError(f"unknown method {name!r}; known: {', '.join(METHODS)}")
     return METHODS[name]
-
-

@@ -25,7 +25,7 @@ import numpy as np
 def plain(value: Any) -> Any:
     """`value` in terms of what JSON has: dict, list, str, int, float, bool, None.
 
-    Arrays become nested lists, zero-dimensional ones numbers; dataclasses become dicts; paths become
+    Arrays become nested lists, zero-dimensional ones numbers; dataclasses become dicts; paths
     become strings; non-finite numbers become None.
 
     Raises:
@@ -49,7 +49,7 @@ def plain(value: Any) -> Any:
         return sorted(plain(item) for item in value)
     if hasattr(value, "__array__"):
         array = np.asarray(value)
-        if array.dtype.kind in "biuf" or array.dtype.name in ("bfloat16", "float8_e4m3fn"):
+        if array.dtype.kind in "biuf" or array.dtype.name == "bfloat16":
             return plain(array.tolist())
     raise TypeError(f"cannot write a {type(value).__name__} as JSON: {value!r}")
 

@@ -149,19 +149,13 @@ def _channel_sums(x: jax.Array) -> jax.Array:
     A product with a vector of ones: on CPUs twice as fast as XLA's reduction of the inner axes.
     """
     b, h, w, c = x.shape
-    ones = jnp.ones((b, 1, h * w), x.dtype)
-    return jnp.einsum(
-        "bip,bpc->bic",
-        ones,
-        x.reshape(b, h * w, c),
-        precision=lax.Precision.HIGHEST,
-        preferred_element_type=jnp.float32,
-    )[:, 0]
+    ones, flat = jnp.ones((b, 1, h * w)), x.astype(jnp.float32).reshape(b, h * w, c)
+    return jnp.einsum("bip,bpc->bic", ones, flat, precision=lax.Precision.HIGHEST)[:, 0]
 
 
 def _scale_shift(x: jax.Array, factor: jax.Array, offset: jax.Array) -> jax.Array:
-    """x factor + offset in the dtype of x; factor and offset are [B | 1, C]."""
-    return x * factor[:, None, None].astype(x.dtype) + offset[:, None, None].astype(x.dtype)
+    """x factor + offset, float32; factor and offset are [B | 1, C]."""
+    return x.astype(jnp.float32) * factor[:, None, None] + offset[:, None, None]
 
 
 @jax.custom_vjp
@@ -184,10 +178,12 @@ def group_norm(x: jax.Array, scale: jax.Array, bias: jax.Array, average: jax.Arr
 def _group_norm_forward(
     x: jax.Array, scale: jax.Array, bias: jax.Array, average: jax.Array
 ) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-    mean, square = _mix(_channel_sums(x), average), _mix(_channel_sums(x * x), average)
+    wide = x.astype(jnp.float32)
+    mean, square = _mix(_channel_sums(wide), average), _mix(_channel_sums(wide * wide), average)
     inverse = lax.rsqrt(jnp.maximum(square - mean * mean, 0.0) + EPSILON)
     factor = inverse * scale
-    return _scale_shift(x, factor, bias - mean * factor), (x, mean, inverse, scale, average)
+    y = _scale_shift(wide, factor, bias - mean * factor).astype(x.dtype)
+    return y, (x, mean, inverse, scale, average)
 
 
 def _group_norm_backward(
@@ -196,12 +192,13 @@ def _group_norm_backward(
     # With n = (x - mean) inverse, y = n scale + bias and M the mean over a group:
     # dx = inverse (scale dy - M[scale dy] - n M[scale dy n]).
     x, mean, inverse, scale, average = saved
+    wide, dy = x.astype(jnp.float32), dy.astype(jnp.float32)
     dy_sum = _channel_sums(dy)
-    dyn_sum = (_channel_sums(dy * x) - mean * dy_sum) * inverse
+    dyn_sum = (_channel_sums(dy * wide) - mean * dy_sum) * inverse
     first = inverse * _mix(dy_sum * scale, average)
     second = inverse * inverse * _mix(dyn_sum * scale, average)
-    dx = _scale_shift(dy, inverse * scale, second * mean - first)
-    return dx - x * second[:, None, None].astype(x.dtype), dyn_sum.sum(0), dy_sum.sum(0), None
+    dx = _scale_shift(dy, inverse * scale, second * mean - first) - wide * second[:, None, None]
+    return dx.astype(x.dtype), dyn_sum.sum(0), dy_sum.sum(0), None
 
 
 def _mix(sums: jax.Array, average: jax.Array) -> jax.Array:
@@ -256,7 +253,8 @@ class BatchNorm(nnx.Module):
 
     def _apply(self, x: jax.Array, mean: jax.Array, var: jax.Array) -> jax.Array:
         factor = lax.rsqrt(var + EPSILON) * self.scale[...]
-        return _scale_shift(x, factor[None], (self.bias[...] - mean * factor)[None])
+        shift = self.bias[...] - mean * factor
+        return _scale_shift(x, factor[None], shift[None]).astype(x.dtype)
 
 
 def _norm(kind: str, channels: int, width: int) -> nnx.Module:
@@ -452,18 +450,24 @@ class Network:
     """(params, batch_stats, images, proprio, *, train) -> (actions, intermediates, batch_stats)."""
 
 
+def _arrays(module: nnx.Module) -> tuple[Params, Params]:
+    """Parameters and running statistics as pure nested dicts."""
+    params, stats = (
+        nnx.to_pure_dict(state) for state in nnx.split(module, nnx.Param, nnx.BatchStat)[1:]
+    )
+    return params, stats
+
+
 def make_network(**options: Any) -> Network:
     """Pure functions around a `Policy`; `options` are its keyword arguments, all but `normals`."""
     # Only shapes: allocates and computes nothing, and raises on wrong options here and now.
     counter = Normals()
     abstract = nnx.eval_shape(lambda: Policy(**options, normals=counter))
-    graph, _, _ = nnx.split(abstract, nnx.Param, nnx.BatchStat)
+    graph = nnx.split(abstract, nnx.Param, nnx.BatchStat)[0]
     total = counter.used
 
     def init(key: jax.Array) -> tuple[Params, Params]:
-        policy = Policy(**options, normals=Normals(jax.random.normal(key, (total,))))
-        _, params, stats = nnx.split(policy, nnx.Param, nnx.BatchStat)
-        return nnx.to_pure_dict(params), nnx.to_pure_dict(stats)
+        return _arrays(Policy(**options, normals=Normals(jax.random.normal(key, (total,)))))
 
     def apply(
         params: Params,
@@ -482,7 +486,7 @@ def make_network(**options: Any) -> Network:
 
 @dataclasses.dataclass(frozen=True)
 class PretrainedTrunk:
-    """Weights of a ResNet-18 of width 64 with batch norm, as read from a file."""
+    """Weights of a ResNet-18 of width 64 with batch norm, as read from a file; a pytree."""
 
     params: Params
     batch_stats: Params
@@ -490,6 +494,11 @@ class PretrainedTrunk:
     """Of the whole file: belongs into the run's record."""
     source: str
     """The file's name."""
+
+
+jax.tree_util.register_dataclass(
+    PretrainedTrunk, data_fields=["params", "batch_stats"], meta_fields=["sha256", "source"]
+)
 
 
 def load_torchvision_resnet18(path: str | Path) -> PretrainedTrunk:
@@ -507,13 +516,11 @@ def load_torchvision_resnet18(path: str | Path) -> PretrainedTrunk:
     """
     tensors, digest = torch_files.read_tensors(path)
     template = nnx.eval_shape(lambda: ResNet18(width=64, norm="batch", normals=Normals()))
-    _, *states = nnx.split(template, nnx.Param, nnx.BatchStat)
-    wanted = [nnx.to_pure_dict(state) for state in states]
     problems: list[str] = []
     used: set[str] = set()
 
-    def take(path: tuple[Any, ...], leaf: Any) -> np.ndarray:
-        name = _torchvision_name(tuple(entry.key for entry in path))
+    def take(path: Any, leaf: Any) -> np.ndarray:
+        name = _torchvision_name([entry.key for entry in path])
         used.add(name)
         if name not in tensors:
             problems.append(f"{name} is missing")
@@ -527,7 +534,7 @@ def load_torchvision_resnet18(path: str | Path) -> PretrainedTrunk:
             problems.append(f"{name} has non-finite values")
         return np.ascontiguousarray(value)
 
-    params, stats = (jax.tree.map_with_path(take, tree) for tree in wanted)
+    params, stats = (jax.tree.map_with_path(take, tree) for tree in _arrays(template))
     extra = sorted(
         name
         for name in set(tensors) - used
@@ -544,7 +551,7 @@ def load_torchvision_resnet18(path: str | Path) -> PretrainedTrunk:
     return PretrainedTrunk(params, stats, digest, Path(path).name)
 
 
-def _torchvision_name(path: tuple[str, ...]) -> str:
+def _torchvision_name(path: Sequence[str]) -> str:
     """("layer2_0", "shortcut_norm", "mean") -> "layer2.0.downsample.1.running_mean"."""
     *modules, leaf = path
     is_norm = "norm" in modules[-1]

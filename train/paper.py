@@ -27,7 +27,7 @@ OOD_DOMAINS = tuple(name for name in DOMAINS if name != "ID")
 METHODS: dict[str, str] = {
     "bc": "BC",
     "palm": "PALM",
-    "palm-paper-frame": "PALM, paper's frame",
+    "palm-paper-frame": "PALM (512 frame)",
     "palm-crop": "PALM w/o crop",
     "palm-overlay": "PALM w/o overlay",
     "palm-aug": "PALM w/o augmentation",

@@ -1,6 +1,6 @@
 """What an evaluation or a sweep leaves behind, on disk and in memory.
 
-A run folder holds (see `docs/reproduce.md`)::
+A run folder holds::
 
     config.json env.json metrics.jsonl checkpoints/ eval.json eval.npz [sweep.npz] ...
 

@@ -1,9 +1,9 @@
-"""The main job: demonstrations, then for each method training, evaluation and pictures, then a report."""
+"""The main job: demonstrations, then training and evaluation of each method, a report."""
 
 import dataclasses
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -109,7 +109,9 @@ def execute(config: Config, console: Console) -> Path:
     if len(folders) > 1:
         write_json(out / "summary.json", counts)
     terminal.results(console, counts)
-    console.print(f"Report: {out / 'report.html'}   ({terminal.duration(time.monotonic() - start)})")
+    console.print(
+        f"Report: {out / 'report.html'}   ({terminal.duration(time.monotonic() - start)})"
+    )
     return out
 
 
@@ -203,7 +205,10 @@ def _train(
         def on_checkpoint(step: int, state: learner.TrainState) -> None:
             meta = {"method": evaluator.method.name, "task": config.task}
             path = checkpoint.save(store, step, state, meta, keep=config.keep)
-            if not stop() and (score := _score_if_missing(config, evaluator, path, step, state)):
+            if stop():
+                return
+            score = _score_if_missing(config, evaluator, path, step, state)
+            if score is not None:
                 log.write(step, {"in_domain_success": score})
 
         learner.run(
@@ -225,7 +230,7 @@ def _train(
 def _score_if_missing(
     config: Config, evaluator: Evaluator, path: Path, step: int, state: learner.TrainState
 ) -> float | None:
-    """In-domain success of a checkpoint, written into its meta data; None where it is not scored."""
+    """In-domain success of a checkpoint, written into its meta data; None if not scored."""
     if step < config.select_from * config.steps or checkpoint.SCORE in checkpoint.read_meta(path):
         return None
     found = evaluator.domain(
@@ -288,7 +293,10 @@ def _film(
     np.savez_compressed(folder / "views.npz", **views)  # type: ignore[arg-type]
     trace = traces.get(_FILMED) or next(iter(traces.values()))
     solved = np.stack(trace.solved).any(0)
-    for outcome, worlds in (("success", np.flatnonzero(solved)), ("failure", np.flatnonzero(~solved))):
+    for outcome, worlds in (
+        ("success", np.flatnonzero(solved)),
+        ("failure", np.flatnonzero(~solved)),
+    ):
         for number, world in enumerate(worlds[: config.videos]):
             film = camera.film(trace, int(world), spec, frame=method.frame)
             frames = videos.episode_frames(
@@ -303,9 +311,7 @@ def _film(
             videos.write_video(folder / "videos" / name, frames)
 
 
-def _sweeps(
-    config: Config, runner: Runner, folders: dict[str, Path], console: Console
-) -> None:
+def _sweeps(config: Config, runner: Runner, folders: dict[str, Path], console: Console) -> None:
     """A coarse sweep of every policy; `python -m palm_jax sweep RUN` makes finer ones."""
     options = sweep.SweepConfig(run=Path())
     angles, (xs, ys) = sweep.angles_of(options.camera), sweep.cells_of(options.workspace)
@@ -335,20 +341,18 @@ def _gallery(folders: dict[str, Path], out: Path) -> None:
     frames: dict[str, np.ndarray] = {}
     for name, folder in folders.items():
         path = folder / "views.npz"
-        if not path.exists():
-            continue
-        with np.load(path) as views:
-            split: Callable[[str], dict[str, np.ndarray]] = lambda kind: {
-                key.partition("/")[2]: views[key] for key in views.files if key.startswith(kind)
-            }
-            inputs[name], frames = split("input/"), split("frame/")
+        if path.exists():
+            with np.load(path) as views:
+                inputs[name], frames = _views(views, "input/"), _views(views, "frame/")
     if inputs:
         figures.save(figures.gallery(inputs, frames=frames), out / "figures" / "gallery.png")
+
+
+def _views(views: Mapping[str, np.ndarray], kind: str) -> dict[str, np.ndarray]:
+    return {name.removeprefix(kind): views[name] for name in views if name.startswith(kind)}
 
 
 def resume_command(config: Config) -> list[str]:
     """The command line that goes on with a run."""
     out = config.out or default_out(config)
     return command(dataclasses.replace(config, out=out), resume=True)
-
-

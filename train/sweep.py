@@ -1,7 +1,8 @@
 """`python -m palm_jax sweep RUN`: success over camera angle x workspace, as heatmaps and curves.
 
-The grid is a `vmap` over `EnvParams`: every cell is the default distribution pinned to one object position
-and one camera angle; only the scenes' other randomness differs between the episodes of a cell.
+The grid is a `vmap` over `EnvParams`: every cell is the default distribution pinned to one object
+position and one camera angle; only the scenes' other randomness differs between the episodes of a
+cell.
 """
 
 import dataclasses
@@ -16,7 +17,7 @@ import tyro
 
 from palm_jax.envs import registry, shifts
 from palm_jax.envs.base import EnvParams
-from palm_jax.envs.rollout import Runner
+from palm_jax.envs.rollout import Runner, take_params
 from palm_jax.train import console as terminal
 from palm_jax.train import records, report, runs, workspace
 from palm_jax.train.evaluate import Evaluator
@@ -54,7 +55,9 @@ def angles_of(text: str) -> np.ndarray:
     """
     match = re.fullmatch(r"(-?[\d.]+)(?::(-?[\d.]+):(\d+))?", text)
     if not match or (match[3] is not None and int(match[3]) < 1):
-        raise ValueError(f"camera: expected LOW:HIGH:COUNT in degrees, e.g. -30:30:13, got {text!r}")
+        raise ValueError(
+            f"camera: expected LOW:HIGH:COUNT in degrees, e.g. -30:30:13, got {text!r}"
+        )
     low, high, count = match[1], match[2] or match[1], int(match[3] or 1)
     return np.radians(np.linspace(float(low), float(high), count))
 
@@ -117,7 +120,7 @@ def sweep(
     success, nan = np.zeros(total, bool), np.zeros(total, bool)
     for first in range(0, total, batch):
         rows = np.arange(first, min(first + batch, total))
-        part = jax.tree.map(lambda v, r=rows: v[r], cells)
+        part = take_params(cells, rows)
         scenes = jax.random.fold_in(jax.random.key(seed), first)
         result = evaluator.episodes(policy, scenes, part, len(rows))
         success[rows], nan[rows] = result.success, result.nan

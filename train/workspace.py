@@ -21,7 +21,17 @@ from palm_jax.train.evaluate import VIEW, Evaluator
 from palm_jax.train.learner import Learner, PolicyState, make_learner
 from palm_jax.train.metrics import write_json
 
-_PACKAGES = ("palm_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx", "numpy")
+_PACKAGES = (
+    "palm_jax",
+    "jax",
+    "jaxlib",
+    "flax",
+    "optax",
+    "orbax-checkpoint",
+    "mujoco",
+    "mujoco-mjx",
+    "numpy",
+)
 _FREE = ("out", "resume", "data", "sweep", "videos", "method")
 """Fields in which a resumed command may differ from the one that began."""
 
@@ -57,7 +67,7 @@ def begin(config: Config, folder: Path, method: str) -> None:
         old = records.load_json(path)
         if not config.resume:
             raise ConfigError(
-                f"{folder} holds a run already: add --resume to go on with it, or choose another --out"
+                f"{folder} holds a run already: add --resume to go on, or choose another --out"
             )
         now = json.loads(json.dumps(fresh, default=str))
         for name in sorted(set(old) | set(now)):

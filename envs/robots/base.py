@@ -7,9 +7,9 @@ import dataclasses
 class Robot:
     """A robot arm with a two-finger gripper.
 
-    Every robot MJCF has the base body `robot_base`, the sites `flange` and `tcp` (origin between the
-    finger pads, z the approach direction, y the opening axis) and position actuators, first the arm's,
-    then the gripper's.
+    Every robot MJCF has the base body `robot_base`, the sites `flange` and `tcp` (origin between
+    the finger pads, z the approach direction, y the opening axis) and position actuators, first
+    the arm's, then the gripper's.
 
     Attributes:
       name: key in `ROBOTS`.

@@ -1,4 +1,4 @@
-"""One table of tasks. Adding one is one MJCF in `assets/tasks/`, one file here and one row below."""
+"""One table of tasks. Adding one: an MJCF in `assets/tasks/`, a file here, a row below."""
 
 from palm_jax.envs.tasks.base import TABLE_HEIGHT, WORKSPACE_CENTRE, Task
 from palm_jax.envs.tasks.lift_lid import LIFT_LID

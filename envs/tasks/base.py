@@ -62,11 +62,11 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def bind(self, model: mujoco.MjModel, robot: Robot) -> Any:
-        """Looks names up in the compiled model, once: the ids that the functions below are given."""
+        """Looks names up in the compiled model, once: the `ids` that the functions below get."""
 
     @abc.abstractmethod
     def place(self, ids: Any, qpos: jax.Array, xy: jax.Array, yaw: jax.Array) -> Placement:
-        """Puts the target object at `xy` [2] (metres, world), turned by `yaw` [] about z, at rest."""
+        """Puts the target object at `xy` [2] (metres), turned by `yaw` [] about z, at rest."""
 
     @abc.abstractmethod
     def success(self, ids: Any, data: mjx.Data, start: jax.Array) -> jax.Array:

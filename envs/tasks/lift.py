@@ -16,9 +16,14 @@ from palm_jax.envs.world import Contact
 
 PAD_FRICTION = 1.5
 OBJECT_FRICTION = 1.0
-_CLOSE_HEIGHT = 0.008  # closing starts this far above the grasp: one frame of closing teaches nothing
-_CLOSE_RADIUS = 0.005
-_CLOSE_ANGLE = 0.08
+# The gripper closes within this of the grasp. The funnel below makes the height tell when that is:
+# what a policy must see at a glance, it learns; a conjunction of millimetres it would wait for.
+_CLOSE_HEIGHT = 0.014
+_CLOSE_RADIUS = 0.013
+_CLOSE_ANGLE = 0.25
+# The funnel: how far the hand stays up for an error sideways or in yaw.
+_FUNNEL_RADIUS = 0.005
+_FUNNEL_ANGLE = 0.06
 _LIFT_MARGIN = 0.03  # the expert heads for a point this far beyond the height that counts as solved
 _FUNNEL_SLOPE = 2.0  # metres of extra height per metre of lateral error
 _FUNNEL_SLOPE_ANGLE = 0.08  # metres of extra height per radian of yaw error
@@ -111,8 +116,8 @@ class LiftTask(Task):
         grasp = data.site_xpos[ids.grasp_site]
         lateral = jnp.linalg.norm(grasp[:2] - tcp[:2, 3])
         above = jnp.clip(
-            _FUNNEL_SLOPE * (lateral - _CLOSE_RADIUS)
-            + _FUNNEL_SLOPE_ANGLE * (jnp.abs(turn) - _CLOSE_ANGLE),
+            _FUNNEL_SLOPE * (lateral - _FUNNEL_RADIUS)
+            + _FUNNEL_SLOPE_ANGLE * (jnp.abs(turn) - _FUNNEL_ANGLE),
             0.0,
             0.08,
         )
@@ -132,7 +137,7 @@ class LiftTask(Task):
         return Command(pointing_down(position, yaw), jnp.where(arrived | closing, 0.0, 1.0))
 
     def _turn_to_object(self, rotation: jax.Array, hand_yaw: jax.Array) -> jax.Array:
-        """Yaw [] by which the hand must turn; a two-finger gripper is the same after half a turn."""
+        """Yaw [] by which the hand must turn; two fingers are the same after half a turn."""
         if not self.aligned:
             return jnp.zeros(())
         yaw = jnp.arctan2(rotation[1, 0], rotation[0, 0])
@@ -141,4 +146,3 @@ class LiftTask(Task):
     def _holding_opening(self) -> float:
         # The Panda's 0.08 m at full opening; other grippers stall at the same width.
         return self.grasp_width / 0.08 + 0.08
-

@@ -1,8 +1,8 @@
 """Lift Lid: take the lid off a saucepan by its knob (RLBench's take_lid_off_saucepan, simplified).
 
-Solved when the knob is held and has risen by 0.105 m within 0.05 m of where it was: RLBench's detector is a
-box of 0.10 x 0.10 x 0.05 m whose bottom is 0.115 m above the knob's initial centre, which the top of the
-knob enters after 0.105 m.
+Solved when the knob is held and has risen by 0.105 m within 0.05 m of where it was: RLBench's
+detector is a box of 0.10 x 0.10 x 0.05 m whose bottom is 0.115 m above the knob's initial centre,
+which the top of the knob enters after 0.105 m.
 """
 
 from palm_jax.envs.tasks.base import TABLE_HEIGHT

@@ -1,7 +1,7 @@
 """Lift Spam: pick a rectangular can across its short side and lift it 0.10 m.
 
-The paper gives no geometry for this task; the can has the size of the potted meat can of the YCB set, and
-success follows Lift Lid: held by both fingers, above a height.
+The paper gives no geometry for this task; the can has the size of the potted meat can of the YCB
+set, and success follows Lift Lid: held by both fingers, above a height.
 """
 
 from palm_jax.envs.tasks.base import TABLE_HEIGHT

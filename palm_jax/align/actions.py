@@ -34,6 +34,11 @@ def encode_delta(tcp: ArrayLike, target: ArrayLike) -> jax.Array:
     tcp, target = as_float(tcp, "tcp", (4, 4)), as_float(target, "target", (4, 4))
     check_pose(tcp, "tcp")
     check_pose(target, "target")
+    return _encode_delta(tcp, target)
+
+
+@jax.jit
+def _encode_delta(tcp: jax.Array, target: jax.Array) -> jax.Array:
     inverse = jnp.swapaxes(tcp[..., :3, :3], -1, -2)
     rotation = matmul(inverse, target[..., :3, :3])
     offset = matmul(inverse, (target[..., :3, 3] - tcp[..., :3, 3])[..., None])[..., 0]
@@ -56,7 +61,11 @@ def apply_delta(tcp: ArrayLike, delta: ArrayLike) -> jax.Array:
         raise ShapeError(
             "delta: expected 9 numbers (6D, xyz), got 10; drop the gripper command: action[..., :9]"
         )
-    delta = as_float(delta, "delta", (9,))
+    return _apply_delta(tcp, as_float(delta, "delta", (9,)))
+
+
+@jax.jit
+def _apply_delta(tcp: jax.Array, delta: jax.Array) -> jax.Array:
     base = tcp[..., :3, :3]
     rotation = matmul(base, matrix_from_6d(delta[..., :6]))
     position = tcp[..., :3, 3] + matmul(base, delta[..., 6:, None])[..., 0]
@@ -73,6 +82,9 @@ def achieved_deltas(tcp: ArrayLike) -> jax.Array:
 
     Returns:
       [T, 9]; the last row is the identity (the paper's labels).
+
+    Raises:
+      ShapeError, PoseError: see `encode_delta`.
     """
     tcp = as_float(tcp, "tcp", (4, 4))
     return encode_delta(tcp, jnp.concatenate([tcp[1:], tcp[-1:]]))
@@ -111,6 +123,9 @@ def gripper_labels(opening: ArrayLike, *, threshold: float = 0.02) -> jax.Array:
     Returns:
       [T] 1 (open) or 0 (close): 1 after a rise, 0 after a fall, else as in the frame before; at
       first 1 if the opening exceeds 0.9; the last frame repeats the one before it.
+
+    Raises:
+      ShapeError: opening not [T] with at least two frames.
     """
     opening = jnp.asarray(opening, jnp.float32)
     if opening.ndim != 1 or opening.shape[0] < 2:
@@ -118,6 +133,11 @@ def gripper_labels(opening: ArrayLike, *, threshold: float = 0.02) -> jax.Array:
             f"opening: expected [T] with at least 2 frames, got {list(opening.shape)}; "
             "batch episodes of one length with jax.vmap"
         )
+    return _gripper_labels(opening, jnp.asarray(threshold, jnp.float32))
+
+
+@jax.jit
+def _gripper_labels(opening: jax.Array, threshold: jax.Array) -> jax.Array:
     change = jnp.diff(opening)
     frames = jnp.arange(change.shape[0])
     latest = lax.cummax(jnp.where(jnp.abs(change) > threshold, frames, -1))

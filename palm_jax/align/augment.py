@@ -10,6 +10,7 @@ order is perspective, overlay, normalisation, crop.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -64,6 +65,7 @@ def overlay_blend(image: ArrayLike, background: ArrayLike, alpha: ArrayLike) -> 
     return _blend(image, background, jnp.asarray(alpha, jnp.float32))
 
 
+@jax.jit
 def _blend(image: jax.Array, background: jax.Array, alpha: jax.Array) -> jax.Array:
     start = image.astype(jnp.float32)
     mixed = start + alpha * (_to_dtype(background, image.dtype) - start)
@@ -121,11 +123,19 @@ def random_overlay(
         )
     check_range(fraction, "fraction", 0.0, 1.0)
     check_range(alpha, "alpha", 0.0, 1.0)
+    count = int(fraction * images.shape[0])
+    return _random_overlay(key, images, bank, count, jnp.asarray(alpha, jnp.float32))
+
+
+@partial(jax.jit, static_argnames="count")
+def _random_overlay(
+    key: jax.Array, images: jax.Array, bank: jax.Array, count: int, alpha: jax.Array
+) -> jax.Array:
     batch = images.shape[0]
     order_key, bank_key = jax.random.split(key)
-    chosen = jax.random.permutation(order_key, batch) < int(fraction * batch)
+    chosen = jax.random.permutation(order_key, batch) < count
     pick = jax.random.randint(bank_key, (batch,), 0, bank.shape[0])
-    weights = jnp.where(chosen, jnp.asarray(alpha, jnp.float32), 0.0)
+    weights = jnp.where(chosen, alpha, 0.0)
     return _if_any(weights > 0, _blend_picked, images, bank, pick, weights)
 
 
@@ -231,6 +241,7 @@ def _sample(image: jax.Array, column: jax.Array, row: jax.Array) -> jax.Array:
     return _from_float(total, image.dtype)
 
 
+@jax.jit
 def _warp(image: jax.Array, corners: jax.Array, active: jax.Array | bool = True) -> jax.Array:
     return _sample(image, *_source_points(corners, active, *image.shape[:2]))
 
@@ -264,11 +275,19 @@ def random_perspective(
     images = as_image(images, "images", rank=4, rgb=True)
     check_range(distortion, "distortion", 0.0, 0.999)
     check_range(probability, "probability", 0.0, 1.0)
+    strength = jnp.asarray(distortion, jnp.float32), jnp.asarray(probability, jnp.float32)
+    return _random_perspective(key, images, *strength)
+
+
+@jax.jit
+def _random_perspective(
+    key: jax.Array, images: jax.Array, distortion: jax.Array, probability: jax.Array
+) -> jax.Array:
     batch, height, width, _ = images.shape
     corner_key, choice_key = jax.random.split(key)
     outer = jnp.asarray([[0, 0], [width, 0], [width, height], [0, height]], jnp.float32)
     inwards = jnp.asarray([[1, 1], [-1, 1], [-1, -1], [1, -1]], jnp.float32)
-    reach = jnp.asarray(distortion, jnp.float32) / 2 * jnp.asarray([width, height], jnp.float32)
+    reach = distortion / 2 * jnp.asarray([width, height], jnp.float32)
     moves = jax.random.uniform(corner_key, (batch, 4, 2)) * reach * inwards
     chosen = jax.random.bernoulli(choice_key, probability, (batch,))
     return _if_any(chosen, jax.vmap(_warp), images, outer + moves, chosen)
@@ -309,6 +328,7 @@ def subpixel_crop(image: ArrayLike, start: ArrayLike, size: int) -> jax.Array:
     return _subpixel_crop(image, start, size)
 
 
+@partial(jax.jit, static_argnames="size")
 def _subpixel_crop(image: jax.Array, start: jax.Array, size: int) -> jax.Array:
     height, width, _ = image.shape
     count = np.arange(size, dtype=np.float32)
@@ -339,8 +359,14 @@ def random_crop(key: jax.Array, images: ArrayLike, size: int) -> jax.Array:
       OptionError: size not a positive int or larger than the images.
     """
     images = as_image(images, "images", rank=4)
-    batch, height, width, _ = images.shape
+    _, height, width, _ = images.shape
     check_fits(size, height, width, "size")
+    return _random_crop(key, images, size)
+
+
+@partial(jax.jit, static_argnames="size")
+def _random_crop(key: jax.Array, images: jax.Array, size: int) -> jax.Array:
+    batch, height, width, _ = images.shape
     most = jnp.asarray([_slack(width, size), _slack(height, size)], jnp.float32)
     starts = jax.random.uniform(key, (batch, 2)) * most
     return jax.vmap(lambda image, start: _subpixel_crop(image, start, size))(images, starts)

@@ -173,6 +173,7 @@ def inside(camera: Camera, uv: jax.Array, depth: jax.Array) -> jax.Array:
     return (depth > NEAREST_DEPTH) & ((uv >= 0) & (uv < limit)).all(-1)
 
 
+@jax.jit
 def _project(camera: Camera, points: jax.Array) -> tuple[jax.Array, jax.Array]:
     pose = jnp.asarray(camera.cam_to_world, jnp.float32)
     local = matmul(points - pose[:3, 3], pose[:3, :3])

@@ -6,6 +6,7 @@ Images are HWC, uint8 or float32 in [0, 1]; the dtype is kept. (u, v) is in pixe
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -112,6 +113,13 @@ def tcp_crop(
     check_fits(size, height, width, "size")
     check_choice(border, "border", BORDERS)
     _check_uv(uv, height, width)
+    return _tcp_crop(image, uv, jnp.asarray(offset, jnp.float32), size, border)
+
+
+@partial(jax.jit, static_argnames=("size", "border"))
+def _tcp_crop(
+    image: jax.Array, uv: jax.Array, offset: jax.Array, size: int, border: str
+) -> jax.Array:
     return cut_window(image, crop_origin(uv, size, offset), size, border)[0]
 
 
@@ -160,6 +168,7 @@ def resize(image: ArrayLike, size: int | tuple[int, int]) -> jax.Array:
     return resize_any(image, rows, columns)
 
 
+@partial(jax.jit, static_argnames=("rows", "columns"))
 def resize_any(image: jax.Array, rows: int, columns: int) -> jax.Array:
     """`resize` without its checks."""
     if image.shape[:2] == (rows, columns):

@@ -33,7 +33,7 @@ from palm_jax.align.proprio import LAYOUTS, _proprio
 
 
 @jax.tree_util.register_static
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class AlignSpec:
     """What a policy sees. Static under jit (a pytree without leaves, hashable).
 
@@ -172,7 +172,8 @@ def _align(
     if spec.overlay:
         points = drawing.overlay_points(camera, tcp, spec.axis_length)
         points = drawing.to_pixels(_jittered(points, overlay_jitter))
-        image = drawing.paint(image, drawing.sharp(points, spec.strokes, rows, columns))
+        covered = drawing.coverage(points, spec.strokes, rows, columns, sharp=True)
+        image = drawing.paint(image, covered)
     image = cropping.resize_any(image, spec.size, spec.size)
     return Aligned(image, _proprio(tcp, opening, camera, spec.layout), valid)
 
@@ -247,7 +248,10 @@ def window_origin(
       origin: int32 [2] (row, col) of the size x size window's top left pixel in `view_camera`'s
         frame. With border "shift" it is moved so that the window lies inside the frame; with the
         other borders it may lie outside, and a renderer shows what is there. Zeros for crop=None.
-      valid: bool, the TCP is in front of the camera and inside the frame. No error is raised.
+      valid: bool, the TCP is in front of the camera and inside the frame. No value is checked.
+
+    Raises:
+      ShapeError: tcp not [4, 4].
     """
     tcp = as_single(tcp, "tcp", (4, 4))
     uv, valid = _seen(view_camera, tcp)
@@ -305,8 +309,8 @@ def align_window(
     if spec.overlay:
         points = drawing.overlay_points(view_camera, tcp, spec.axis_length)
         points = _jittered(points, None if jitter is None else spec.scale * jnp.asarray(jitter))
-        shift = jnp.asarray(origin, jnp.float32)[::-1]
-        local = dataclasses.replace(points, uv=points.uv - shift)
         strokes = spec.strokes.scaled(spec.scale)
-        image = drawing.paint(image, drawing.smooth(local, strokes, spec.size, spec.size))
+        rows, columns = jnp.asarray(origin, jnp.int32)[:, None] + jnp.arange(spec.size)
+        covered = drawing.coverage(points, strokes, rows, columns, sharp=False)
+        image = drawing.paint(image, covered)
     return Aligned(image, _proprio(tcp, opening, view_camera, spec.layout), valid)

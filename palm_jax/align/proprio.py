@@ -6,6 +6,8 @@ its y axis. (Some libraries take rows.) Metres, float32.
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -20,7 +22,13 @@ OPEN_ABOVE = 0.95
 
 
 def rotation_6d(matrix: ArrayLike) -> jax.Array:
-    """[..., 3, 3] rotation -> [..., 6]: column 0, then column 1 (PALM, proprioception).
+    """First two columns of a rotation, one after the other (PALM, proprioception).
+
+    Args:
+      matrix: [..., 3, 3].
+
+    Returns:
+      [..., 6]: column 0, then column 1.
 
     Raises:
       ShapeError: last axes not [3, 3].
@@ -44,17 +52,25 @@ def _unit(vector: jax.Array, otherwise: jax.Array) -> jax.Array:
 
 
 def matrix_from_6d(vector: ArrayLike) -> jax.Array:
-    """[..., 6] -> [..., 3, 3] rotation by Gram-Schmidt; the inverse of `rotation_6d`.
+    """Rotation of a 6D vector by Gram-Schmidt; the inverse of `rotation_6d`.
 
-    The first three numbers give the x axis, the next three, made perpendicular, the y axis; z is
-    their cross product. Any finite input gives a rotation: a first half of (almost) zero length is
-    replaced by (1, 0, 0), a second half (almost) parallel to the first by the coordinate axis
-    x or y that is less parallel to it. NaN halves are replaced in the same way.
+    Args:
+      vector: [..., 6]: the x axis, then the y axis, of any lengths and not quite perpendicular.
+
+    Returns:
+      [..., 3, 3] rotation: x normalised, y made perpendicular to it, z their cross product. Any
+      input gives a rotation: a first half of (almost) zero length is replaced by (1, 0, 0), a
+      second half (almost) parallel to the first by the coordinate axis x or y that is less parallel
+      to it; halves that are not finite are replaced in the same way.
 
     Raises:
       ShapeError: last axis not 6.
     """
-    vector = as_float(vector, "vector", (6,))
+    return _matrix_from_6d(as_float(vector, "vector", (6,)))
+
+
+@jax.jit
+def _matrix_from_6d(vector: jax.Array) -> jax.Array:
     x = _unit(vector[..., :3], jnp.asarray([1.0, 0.0, 0.0]))
     spare = jnp.where(jnp.abs(x[..., :1]) < 0.9, jnp.eye(3)[0], jnp.eye(3)[1])
     spare = _unit(_without(spare, x), spare)
@@ -99,6 +115,7 @@ def proprio(
     return _proprio(tcp, jnp.asarray(opening, jnp.float32), camera, layout)
 
 
+@partial(jax.jit, static_argnames="layout")
 def _proprio(tcp: jax.Array, opening: jax.Array, camera: Camera | None, layout: str) -> jax.Array:
     parts = []
     rotation = tcp[..., :3, :3]

@@ -1,24 +1,38 @@
 """Which geom each pixel sees, as one int32 key per pixel; and which lights its point does not see.
 
-A key is the bits of the ray's depth (order-preserving for positive floats) with the low bits replaced by the
-geom's slot: "nearest" is a plain minimum, and a loop carries a single array. The depth lost by that is found
-again by `intersect.surface`.
+A key is the bits of the ray's depth (order-preserving for positive floats) with the low bits
+replaced by the geom's slot: "nearest" is a plain minimum, and a loop carries a single array. The
+depth lost by that is found again by `intersect.surface`.
 
-Tiled form (CPU): bounding boxes tell which geoms can touch a tile, one bit each; a loop per family takes
-every tile through its own bits, as often as the longest list of the block needs. Fused form (accelerators):
-one broadcast and one minimum per family, which the compiler keeps in registers. Neither stores anything of
-size rays x geoms.
+Tiled form (CPU): bounding boxes tell which geoms can touch a tile, one bit each; a loop per family
+takes every tile through its own bits, as often as the longest list of the block needs. Fused form
+(accelerators): one broadcast and one minimum per family, which the compiler keeps in registers.
+Neither stores anything of size rays x geoms.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
-from palm_jax.render.intersect import NEAR, TESTS, Placed, Vector
-from palm_jax.render.tables import Options, Tables, TileTable, pixel_offsets, slot_ranges, TILE
+from palm_jax.render.intersect import (
+    NEAR,
+    TESTS,
+    Placed,
+    Vector,
+    components,
+    dot,
+    each,
+    larger,
+    smaller,
+    turned,
+)
+from palm_jax.render.scene import Scene
+from palm_jax.render.tables import TILE, Options, Tables, TileTable, pixel_offsets, slot_ranges
 
 NOTHING = 0x7F7FFFFF
 """Bits of the largest float32: a key beyond every hit."""
@@ -37,32 +51,31 @@ def pixel_coordinates(tiles: TileTable, stride: int) -> tuple[jax.Array, jax.Arr
     return (tiles["left"] + du) - tiles["cx"], (tiles["top"] + dv) - tiles["cy"]
 
 
-# -- which geoms can touch which tiles ----------------------------------------------------------------------
+# -- which geoms can touch which tiles -------------------------------------------------------------
 
 
 def touching(options: Options, tables: Tables) -> jax.Array:
-    """bool [N, G]: may the geom show in the tile? Its bounding box against the tile's four planes."""
-    k, placed = tables.intrinsics, tables.placed
-    skew = k[:, 0, 1, None]
+    """bool [N, G]: may the geom show in the tile? (Bounding box against the tile's four planes.)"""
+    k, placed = tables.intrinsics[:, None, None], tables.placed
+    # Centre and half axes of the bounding box, [W, G, 4] per component.
+    axes = placed.turn * placed.reach[..., None]
+    x, y, z = components(jnp.concatenate([placed.centre[..., None, :], axes], -2))
     last = float((TILE - 1) * options.stride)
 
-    def between(first: jax.Array, centre: jax.Array, along: Callable[[Vector], jax.Array]) -> jax.Array:
+    def between(first: jax.Array, centre: jax.Array, along: jax.Array) -> jax.Array:
         # A plane through the camera and the pixel line u = e has the normal (fx, skew, cx - e).
         def outermost(edge: jax.Array, sign: float) -> jax.Array:
-            slope = (centre[:, None] - edge)[:, :, None]
-            value = sign * (along(placed.centre)[:, None] + slope * placed.centre[2][:, None])
-            for axis in placed.axes:
-                value += jnp.abs(along(axis)[:, None] + slope * axis[2][:, None])
-            return value
+            value = along[:, None] + (centre - edge[:, :, None, None]) * z[:, None]
+            spread = [jnp.abs(value[..., i]) for i in (1, 2, 3)]
+            return sign * value[..., 0] + (spread[0] + (spread[1] + spread[2]))
 
-        # From first pixel's centre to the last one's, and a tenth of a pixel for rounding.
+        # From the first pixel's centre to the last one's, and a tenth of a pixel for rounding.
         return (outermost(first + 0.4, 1.0) >= 0) & (outermost(first + last + 0.6, -1.0) >= 0)
 
-    in_column = between(
-        tables.left, k[:, 0, 2], lambda p: k[:, 0, 0, None] * p[0] + skew * p[1]
-    )
-    in_row = between(tables.top, k[:, 1, 2], lambda p: k[:, 1, 1, None] * p[1])
-    deepest = placed.centre[2] + sum(jnp.abs(axis[2]) for axis in placed.axes)
+    in_column = between(tables.left, k[..., 0, 2, None], k[..., 0, 0] * x + k[..., 0, 1] * y)
+    in_row = between(tables.top, k[..., 1, 2, None], k[..., 1, 1] * y)
+    depths = jnp.abs(z)
+    deepest = z[..., 0] + (depths[..., 1] + (depths[..., 2] + depths[..., 3]))
     ahead = placed.ok & (deepest > NEAR)
     flags = in_row[:, :, None] & in_column[:, None] & ahead[:, None, None]
     return flags.reshape(-1, flags.shape[-1])
@@ -95,26 +108,24 @@ def words(types: Sequence[str], flags: jax.Array) -> jax.Array:
     return jnp.stack([word(group.slots) for group in groups(types)], -1)
 
 
-def _rows(columns: Sequence[jax.Array]) -> jax.Array:
-    """[W, g] columns -> rows [W * (g + 1), F]; a world's last row is NaN, which nothing hits."""
-    rows = jnp.stack(columns, -1)
-    rows = jnp.pad(rows, ((0, 0), (0, 1), (0, 0)), constant_values=jnp.nan)
-    return rows.reshape(-1, len(columns))
+def _rows(columns: jax.Array) -> jax.Array:
+    """[W, g, F] -> rows [W * (g + 1), F]; a world's last row is NaN, which nothing hits."""
+    rows = jnp.pad(columns, ((0, 0), (0, 1), (0, 0)), constant_values=jnp.nan)
+    return rows.reshape(-1, rows.shape[-1])
 
 
 def _part(placed: Placed, slots: range) -> Placed:
     return jax.tree.map(lambda x: x[:, slots.start : slots.stop], placed)
 
 
-def hit_rows(types: Sequence[str], placed: Placed) -> list[jax.Array]:
-    """Per group, what its intersection test reads."""
-    return [_rows(TESTS[g.family].columns(_part(placed, g.slots))) for g in groups(types)]
-
-
 def _over_lists(
     word: jax.Array, count: int, body: Callable[[jax.Array, jax.Array], jax.Array], start: jax.Array
 ) -> jax.Array:
-    """Runs `body(index, carry)` over the set bits of each tile's word; index [N] is `count` where none is left."""
+    """Runs `body(index, carry)` over the set bits of each tile's word.
+
+    `index` is int32 [N], and `count` for tiles whose bits are used up. There are as many rounds as
+    the fullest word has bits.
+    """
 
     def step(_: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         carry, left = state
@@ -125,50 +136,272 @@ def _over_lists(
     return lax.fori_loop(0, longest, step, (start, word))[0]
 
 
+def _numbers(rows: jax.Array) -> list[jax.Array]:
+    return [rows[:, i : i + 1] for i in range(rows.shape[1])]
+
+
+# -- the nearest geom ------------------------------------------------------------------------------
+
+
+class Seen(NamedTuple):
+    """What each pixel sees, [N, 144] each."""
+
+    key: jax.Array  # int32: depth bits and slot, `NOTHING` where there is no geom
+    shadows: jax.Array | None  # int32: bit i is set where light i does not reach
+
+
+class Search(NamedTuple):
+    """What the tiled loops read besides the tiles."""
+
+    hit_rows: list[jax.Array]  # per group [W * (g + 1), F]
+    shadow_rows: dict[int, list[jax.Array]]  # the same for every light that casts shadows
+    boxes: (
+        jax.Array
+    )  # [W, G, 15] bounding boxes: centre, three unit axes (camera frame), half sizes
+    ok: jax.Array  # bool [W, G]
+
+
+def prepare_tiled(
+    options: Options, scene: Scene, tables: Tables
+) -> tuple[jax.Array, jax.Array, Search]:
+    """Lists uint32 [N, groups] of geoms per tile, their lengths int32 [N], and the loops' input."""
+    placed = tables.placed
+    lists = words(scene.types, touching(options, tables))
+    length = jnp.sum(lax.population_count(lists), -1).astype(jnp.int32)
+    hits = [_rows(TESTS[g.family].columns(_part(placed, g.slots))) for g in groups(scene.types)]
+    shadows = {}
+    if options.shadowed:
+        for i, casts in enumerate(scene.lights.casts_shadow):
+            if casts:
+                columns = _shadow_columns(placed, tables, i, scene.lights.directional[i])
+                shadows[i] = [
+                    _rows(columns[:, g.slots.start : g.slots.stop]) for g in groups(scene.types)
+                ]
+    axes = placed.turn.reshape(*placed.half.shape, 9)
+    boxes = jnp.concatenate([placed.centre, axes, placed.reach], -1)
+    return lists, length, Search(hits, shadows, boxes, placed.ok)
+
+
+def seen_tiled(
+    options: Options,
+    scene: Scene,
+    search: Search,
+    tiles: TileTable,
+    world: jax.Array,
+    lists: jax.Array,
+) -> Seen:
+    """What the pixels of N tiles see; `lists` uint32 [N, groups] names the geoms to try."""
+    key = _nearest_tiled(options, scene.types, search, tiles, world, lists)
+    if not options.shadowed:
+        return Seen(key, None)
+    return Seen(key, _shadows_tiled(options, scene, search, tiles, world, key))
+
+
+def seen_fused(options: Options, scene: Scene, tables: Tables) -> Seen:
+    """What all pixels of all worlds see: one broadcast over a family's geoms and one reduction."""
+    key = _nearest_fused(options, scene.types, tables)
+    if not options.shadowed:
+        return Seen(key, None)
+    return Seen(key, _shadows_fused(options, scene, tables, key))
+
+
 def _packed(depth: jax.Array, counts: jax.Array, slot: jax.Array, mask: int) -> jax.Array:
     bits = lax.bitcast_convert_type(depth, jnp.int32)
     return jnp.where(counts & (depth > NEAR), (bits & ~mask) | slot, NOTHING)
 
 
-def nearest_tiled(
+def _nearest_tiled(
+    options: Options,
     types: Sequence[str],
-    stride: int,
+    search: Search,
     tiles: TileTable,
     world: jax.Array,
     lists: jax.Array,
-    rows: Sequence[jax.Array],
 ) -> jax.Array:
-    """Keys int32 [N, 144] of N tiles with the geoms of `lists` uint32 [N, groups]."""
-    du, dv = pixel_offsets(stride)
-    mask = slot_mask(types)
-    best = jnp.full((lists.shape[0], du.shape[0]), NOTHING, jnp.int32)
-    for i, (group, table) in enumerate(zip(groups(types), rows, strict=True)):
-        count = len(group.slots)
+    best = jnp.full((lists.shape[0], TILE * TILE), NOTHING, jnp.int32)
+    for i, group in enumerate(groups(types)):
 
-        def closer(
-            index: jax.Array, best: jax.Array, table=table, count=count, group=group
-        ) -> jax.Array:
-            row = table[world * (count + 1) + index]
-            u, v = (tiles["left"] + du) - tiles["cx"], (tiles["top"] + dv) - tiles["cy"]
-            hit = TESTS[group.family].hit
-            depth, counts = hit([row[:, j : j + 1] for j in range(row.shape[1])], u, v)
-            return jnp.minimum(best, _packed(depth, counts, index[:, None] + group.slots.start, mask))
+        def closer(group: Group, rows: jax.Array, index: jax.Array, best: jax.Array) -> jax.Array:
+            u, v = pixel_coordinates(tiles, options.stride)
+            numbers = _numbers(rows[world * (len(group.slots) + 1) + index])
+            depth, counts = TESTS[group.family].hit(numbers, u, v)
+            slot = index[:, None] + group.slots.start
+            return jnp.minimum(best, _packed(depth, counts, slot, slot_mask(types)))
 
-        best = _over_lists(lists[:, i], count, closer, best)
+        body = functools.partial(closer, group, search.hit_rows[i])
+        best = _over_lists(lists[:, i], len(group.slots), body, best)
     return best
 
 
-def nearest_fused(types: Sequence[str], stride: int, tables: Tables) -> jax.Array:
-    """Keys int32 [N, 144] of all tiles: one broadcast over a family's geoms, one minimum."""
-    u, v = pixel_coordinates(tables.tiles, stride)
+def _nearest_fused(options: Options, types: Sequence[str], tables: Tables) -> jax.Array:
+    u, v = pixel_coordinates(tables.tiles, options.stride)
     worlds = tables.left.shape[0]
     u_row, v_row = (x.reshape(worlds, 1, -1) for x in (u, v))
     best = jnp.full((worlds, u_row.shape[-1]), NOTHING, jnp.int32)
     for name, slots in slot_ranges(types).items():
         part = _part(tables.placed, slots)
-        columns = [x[:, :, None] for x in TESTS[name].columns(part)]
-        depth, counts = TESTS[name].hit(columns, u_row, v_row)
-        slot = jnp.asarray(slots)[None, :, None]
+        columns = TESTS[name].columns(part)[..., None]
+        numbers = [columns[:, :, i] for i in range(columns.shape[2])]
+        depth, counts = TESTS[name].hit(numbers, u_row, v_row)
+        slot = jnp.asarray(slots, jnp.int32)[None, :, None]
         key = _packed(depth, counts & part.ok[:, :, None], slot, slot_mask(types))
         best = jnp.minimum(best, jnp.min(key, axis=1))
     return best.reshape(u.shape)
+
+
+# -- shadows ---------------------------------------------------------------------------------------
+#
+# From the point that a pixel sees towards each light. The point's own geom is left out: it is
+# convex, so it never shades the side that faces the light, and no margin against rounding is needed.
+
+
+def _shadow_columns(placed: Placed, tables: Tables, light: int, directional: bool) -> jax.Array:
+    """[W, G, 16]: rays and eye as in `Placed`, the light in the local frame, half length."""
+    k = tables.intrinsics[:, None, None]
+    a, b, c = (placed.ray[..., i, :] for i in range(3))
+    frame = jnp.stack([a * k[..., 0, 0], b * k[..., 1, 1] + a * k[..., 0, 1], c], -2)
+    local = turned(tables.lights[:, None, light], frame)
+    if not directional:
+        local = local + placed.eye
+    rays = placed.ray.reshape(*placed.half.shape, 9)
+    return jnp.concatenate([rays, placed.eye, local, placed.half[..., None]], -1)
+
+
+def _blocked(
+    family: str,
+    directional: bool,
+    numbers: Sequence[jax.Array],
+    u: jax.Array,
+    v: jax.Array,
+    depth: jax.Array,
+) -> jax.Array:
+    """Does the geom lie between the point at `depth` and the light?"""
+
+    def point(i: int) -> jax.Array:
+        direction = numbers[i] * u + (numbers[3 + i] * v + numbers[6 + i])
+        return numbers[9 + i] + depth * direction
+
+    p, light = each(point), each(lambda i: numbers[12 + i])
+    if directional:
+        return TESTS[family].blocks(p, light, numbers[15], float("inf"))
+    return TESTS[family].blocks(p, _minus(light, p), numbers[15], 1.0)
+
+
+def _split_key(types: Sequence[str], key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    mask = slot_mask(types)
+    return lax.bitcast_convert_type(key & ~mask, jnp.float32), key & mask
+
+
+def _shadows_tiled(
+    options: Options,
+    scene: Scene,
+    search: Search,
+    tiles: TileTable,
+    world: jax.Array,
+    key: jax.Array,
+) -> jax.Array:
+    depth, slot = _split_key(scene.types, key)
+    bits = jnp.zeros_like(key)
+    for light, tables in search.shadow_rows.items():
+        directional = scene.lights.directional[light]
+        flags = _between(options, search, tiles, world, key, slot, light, directional)
+        lists = words(scene.types, flags)
+        for i, group in enumerate(groups(scene.types)):
+
+            def shade(
+                group: Group,
+                rows: jax.Array,
+                light: int,
+                directional: bool,
+                index: jax.Array,
+                bits: jax.Array,
+            ) -> jax.Array:
+                u, v = pixel_coordinates(tiles, options.stride)
+                numbers = _numbers(rows[world * (len(group.slots) + 1) + index])
+                blocked = _blocked(group.family, directional, numbers, u, v, depth)
+                blocked &= slot != index[:, None] + group.slots.start
+                return bits | jnp.where(blocked, 1 << light, 0)
+
+            body = functools.partial(shade, group, tables[i], light, directional)
+            bits = _over_lists(lists[:, i], len(group.slots), body, bits)
+    return bits
+
+
+def _between(
+    options: Options,
+    search: Search,
+    tiles: TileTable,
+    world: jax.Array,
+    key: jax.Array,
+    slot: jax.Array,
+    light: int,
+    directional: bool,
+) -> jax.Array:
+    """bool [N, G]: may the geom lie between some point that the tile shows and the light?
+
+    The segment from the middle of the tile's points to the light, against the geom's bounding box
+    grown by the radius of the points. A geom that is all that the tile shows does not shade itself.
+    """
+    middle, radius = _points(options, tiles, key)
+    towards = tiles.vector(f"light{light}")
+    if not directional:
+        towards = _minus(towards, middle)
+    box = search.boxes[world]
+    from_box = _minus(middle, components(box))
+    near, far = jnp.zeros(()), jnp.asarray(jnp.inf if directional else 1.0)
+    for i in range(3):
+        axis = components(box[..., 3 + 3 * i : 6 + 3 * i])
+        start, step = dot(axis, from_box), dot(axis, towards)
+        inverse = 1 / jnp.where(jnp.abs(step) < 1e-9, 1e-9, step)
+        half = 1.001 * (box[..., 12 + i] + radius) + 1e-4
+        low, high = (-half - start) * inverse, (half - start) * inverse
+        near, far = larger(smaller(low, high), near), smaller(larger(low, high), far)
+    hit = key < NOTHING
+    first = jnp.min(jnp.where(hit, slot, NOTHING), -1, keepdims=True)
+    last = jnp.max(jnp.where(hit, slot, -1), -1, keepdims=True)
+    only = (first == last) & (np.arange(box.shape[1], dtype=np.int32) == first)
+    return (near <= far) & search.ok[world] & (last >= 0) & ~only
+
+
+def _points(options: Options, tiles: TileTable, key: jax.Array) -> tuple[Vector, jax.Array]:
+    """Middle and radius of a ball round the points that a tile shows, camera frame; [N, 1] each."""
+    depth, hit = lax.bitcast_convert_type(key, jnp.float32), key < NOTHING
+    near = jnp.min(jnp.where(hit, depth, jnp.inf), -1, keepdims=True)
+    far = jnp.max(jnp.where(hit, depth, 0.0), -1, keepdims=True)
+    last = (TILE - 1) * options.stride
+    top = tiles["top"] + 0.5 - tiles["cy"]
+    left = tiles["left"] + 0.5 - tiles["cx"]
+    y = top / tiles["fy"], (top + last) / tiles["fy"]
+    tilt = jnp.maximum(jnp.abs(y[0]), jnp.abs(y[1])) * jnp.abs(tiles["skew"])
+    x = (left - tilt) / tiles["fx"], (left + (last + tilt)) / tiles["fx"]
+    middle, half = [], []
+    for low, high in (x, y, (1.0, 1.0)):
+        first, second = jnp.minimum(low * near, low * far), jnp.maximum(high * near, high * far)
+        middle.append(0.5 * (first + second))
+        half.append(0.5 * (second - first))
+    return (middle[0], middle[1], middle[2]), jnp.sqrt(dot(half, half))  # type: ignore[arg-type]
+
+
+def _minus(p: Vector, q: Vector) -> Vector:
+    return p[0] - q[0], p[1] - q[1], p[2] - q[2]
+
+
+def _shadows_fused(options: Options, scene: Scene, tables: Tables, key: jax.Array) -> jax.Array:
+    depth, slot = _split_key(scene.types, key)
+    worlds = tables.left.shape[0]
+    u, v = pixel_coordinates(tables.tiles, options.stride)
+    u, v, depth, slot = (x.reshape(worlds, 1, -1) for x in (u, v, depth, slot))
+    bits = jnp.zeros((worlds, u.shape[-1]), jnp.int32)
+    for light, casts in enumerate(scene.lights.casts_shadow):
+        if not casts:
+            continue
+        directional = scene.lights.directional[light]
+        columns = _shadow_columns(tables.placed, tables, light, directional)[..., None]
+        for name, slots in slot_ranges(scene.types).items():
+            part = columns[:, slots.start : slots.stop]
+            numbers = [part[:, :, i] for i in range(part.shape[2])]
+            blocked = _blocked(name, directional, numbers, u, v, depth)
+            ok = tables.placed.ok[:, slots.start : slots.stop, None]
+            blocked &= ok & (slot != np.asarray(slots, np.int32)[None, :, None])
+            bits |= jnp.where(jnp.any(blocked, axis=1), 1 << light, 0)
+    return bits.reshape(key.shape)

@@ -1,7 +1,7 @@
-"""`render`: which geom every pixel sees (`nearest`), then its depth, normal and colour.
+"""`render`: finds what every pixel sees (`nearest`), then its depth, id, colour (`pixels`).
 
-Only the second half is differentiated. On CPUs both run over blocks of tiles that fit the caches; the tiles
-are sorted by how many geoms can touch them, so that a block's loops are no longer than its tiles need.
+On CPUs both run over blocks of tiles that fit the caches. The tiles are sorted by how many geoms
+can touch them, so that a block's loops are no longer than its own tiles need.
 """
 
 import functools
@@ -10,22 +10,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
 
-from palm_jax.render import shading
-from palm_jax.render.intersect import Kind, Vector, dot, surface
+from palm_jax._checks import OptionError
 from palm_jax.render.nearest import (
-    NOTHING,
-    hit_rows,
-    nearest_fused,
-    nearest_tiled,
-    pixel_coordinates,
-    slot_mask,
-    touching,
-    words,
+    Seen,
+    prepare_tiled,
+    seen_fused,
+    seen_tiled,
 )
+from palm_jax.render.pixels import PLANES, resolve
 from palm_jax.render.scene import (
     OUTPUTS,
     CameraLike,
@@ -35,21 +30,12 @@ from palm_jax.render.scene import (
     check_names,
     check_shape,
 )
-from palm_jax.render.tables import (
-    TILE,
-    Inputs,
-    Options,
-    Tables,
-    TileTable,
-    GeomTable,
-    make_tables,
-    slot_order,
-    slot_ranges,
-    texture_kinds,
-)
+from palm_jax.render.tables import TILE, Inputs, Options, Tables, TileTable, make_tables
 
-_BLOCK = 512  # tiles taken together; 74 k pixels
+_BLOCK = 512  # tiles taken together: 74 thousand pixels
 _BACKENDS = ("auto", "tiled", "fused")
+
+Planes = dict[str, jax.Array]
 
 
 def render(
@@ -63,36 +49,41 @@ def render(
 ) -> Frame:
     """Draws `scene` as `camera` sees it; one world, batch with `jax.vmap`.
 
-    Under `vmap` any of the scene's arrays, the camera and the window's origin may be batched or shared, and
-    all worlds run in one loop; nested `vmap`s are flattened. A pixel depends on its ray alone: a window has
-    the same bits as that part of the full frame, and a world the same bits in any batch.
+    Under `vmap` any of the scene's arrays, the camera and the window's origin may be batched or
+    shared, and all worlds run in one loop; nested `vmap`s are flattened. On CPUs a pixel depends on
+    its ray alone, to the last bit: a window equals that part of the full frame, a world is the same
+    in any batch.
 
-    Differentiable in every floating-point leaf (reverse and forward): `depth` and `radiance` carry the
-    derivatives of what each pixel sees; the jumps at silhouettes and shadow edges have none.
+    Differentiable in every floating-point leaf (reverse and forward), with a fixed number of
+    operations: `depth` and `radiance` carry the derivatives of what each pixel sees; the jumps at
+    silhouettes and shadow edges have none.
 
     Args:
       scene: what to draw.
-      camera: `K` [3, 3], `cam_to_world` [4, 4] (x right, y down, z forward), static `height`, `width`.
-        A camera with non-finite entries sees nothing.
+      camera: `palm_jax.align.Camera`, or anything with `K` [3, 3], `cam_to_world` [4, 4] (x right,
+        y down, z forward) and static `height`, `width`. Under jit a camera with non-finite entries
+        sees nothing.
       window: pixels of the camera's image to draw; by default all.
       outputs: names out of `OUTPUTS`; the others are None in the result and cost nothing.
-      shadows: hard shadows of the lights with `casts_shadow`; about twice the work.
-      backend: "tiled" (CPU) or "fused" (accelerators); "auto" takes the one for the platform it runs on.
+      shadows: hard shadows of the lights with `casts_shadow`; two to three times the work.
+      backend: "tiled" (CPU) or "fused" (accelerators); "auto" takes the one for the platform.
 
     Returns:
-      `Frame` with H, W of the window. `depth` is planar (along the camera's z), inf where nothing is hit;
-      `segmentation` holds `scene.ids`, -1 where nothing is hit. Surfaces closer together than about 1e-5 of
-      their depth (for up to 64 geoms; twice that with every doubling) count as equal, and the geom whose
-      family comes first in `intersect.FAMILIES` shows.
+      `Frame` with H, W of the window. `depth` is planar (along the camera's z), inf where nothing
+      is hit; `segmentation` holds `scene.ids`, -1 where nothing is hit. Surfaces closer together
+      than about 1e-5 of their depth (for up to 64 geoms; twice that with every doubling) count as
+      equal, and the geom whose family comes first in `intersect.FAMILIES` shows.
 
     Raises:
-      ValueError: an unknown type, texture, output or backend, or a field of the wrong shape.
+      OptionError: an unknown type, texture, output or backend.
+      ShapeError: a field of the wrong shape.
+      DtypeError: a window origin that is not integer.
     """
     outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     check_names(outputs, OUTPUTS, "output")
     check_names((backend,), _BACKENDS, "backend")
     if not outputs:
-        raise ValueError(f"outputs is empty; name at least one of: {', '.join(OUTPUTS)}")
+        raise OptionError(f"outputs is empty; name at least one of: {', '.join(OUTPUTS)}")
     scene.check()
     check_shape("Camera.K", camera.K, (3, 3))
     check_shape("Camera.cam_to_world", camera.cam_to_world, (4, 4))
@@ -107,8 +98,8 @@ def render(
         _as_leaf(camera.cam_to_world),
         jnp.asarray(window.origin, jnp.int32),
     )
-    images = _drawer(options)(jax.tree.map(lambda leaf: leaf[None], inputs))
-    return Frame(**{name: image[0] for name, image in images.items()})
+    planes = _drawer(options)(jax.tree.map(lambda leaf: leaf[None], inputs))
+    return _frame(jax.tree.map(lambda plane: plane[0], planes))
 
 
 def _as_leaf(value: Any) -> jax.Array:
@@ -116,10 +107,24 @@ def _as_leaf(value: Any) -> jax.Array:
     return array if array.dtype == bool else array.astype(jnp.float32)
 
 
-# -- batching and derivatives -------------------------------------------------------------------------------
+def _frame(planes: Planes) -> Frame:
+    """Images [H, W] to the outputs."""
+    radiance = [planes[name] for name in PLANES["radiance"] if name in planes]
+    rgb = None
+    if "rgb" in planes:
+        rgb = lax.bitcast_convert_type(planes["rgb"], jnp.uint8)[..., :3]
+    return Frame(
+        rgb=rgb,
+        radiance=jnp.stack(radiance, -1) if radiance else None,
+        depth=planes.get("depth"),
+        segmentation=planes.get("segmentation"),
+    )
 
 
-def _flattening(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+# -- batching and derivatives ----------------------------------------------------------------------
+
+
+def _flattening(function: Callable[[Inputs], Any]) -> Callable[[Inputs], Any]:
     """`function` of arrays with a leading axis of worlds, such that `vmap` makes that axis longer.
 
     JAX's own batching of a loop with a data-dependent trip count would mask every iteration.
@@ -127,7 +132,7 @@ def _flattening(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     batched = custom_vmap(function)
 
     @batched.def_vmap
-    def rule(size: int, is_batched: tuple, inputs: Any) -> tuple[Any, Any]:
+    def rule(size: int, is_batched: tuple, inputs: Inputs) -> tuple[Any, Any]:
         def widen(leaf: jax.Array, has_axis: bool) -> jax.Array:
             full = leaf if has_axis else jnp.broadcast_to(leaf, (size, *leaf.shape))
             return full.reshape(size * full.shape[1], *full.shape[2:])
@@ -141,28 +146,67 @@ def _flattening(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return batched
 
 
-@functools.lru_cache(maxsize=None)
-def _drawer(options: Options) -> Callable[[Inputs], dict[str, jax.Array]]:
-    """The images as a function of the inputs, with its rules for `vmap` and for derivatives."""
+@functools.cache
+def _drawer(options: Options) -> Callable[[Inputs], Planes]:
+    """Planes [worlds, H, W] as a function of the inputs; knows `vmap` and derivatives."""
     draw_fast = _flattening(functools.partial(_draw, options))
     find = _flattening(functools.partial(_find, options))
 
-    def draw_smooth(inputs: Inputs) -> dict[str, jax.Array]:
+    def draw_smooth(inputs: Inputs) -> Planes:
         # What a pixel sees is piecewise constant: no derivative flows through the loops.
-        key = find(lax.stop_gradient(inputs))
-        tables = make_tables(options, inputs)
-        values = _resolve(options, inputs.scene, tables.tiles, tables.world, tables.geoms, key)
-        return _images(options, values)
+        seen = jax.tree.map(_tiles_first, find(lax.stop_gradient(inputs)))
+        return _images(options, _resolve_all(options, inputs, make_tables(options, inputs), seen))
 
     @jax.custom_jvp
-    def draw(inputs: Inputs) -> dict[str, jax.Array]:
+    def draw(inputs: Inputs) -> Planes:
         return draw_fast(inputs)
 
     @draw.defjvp
     def jvp(primals: tuple[Inputs], tangents: tuple[Inputs]) -> tuple[Any, Any]:
         return jax.jvp(draw_smooth, primals, tangents)
 
-    return draw
+    return jax.jit(draw)
+
+
+def _tiles_first(array: jax.Array) -> jax.Array:
+    """[W, tiles, 144] -> [N, 144]."""
+    return array.reshape(-1, array.shape[-1])
+
+
+def _draw(options: Options, inputs: Inputs) -> Planes:
+    def tiled(inputs: Inputs) -> Planes:
+        def kernel(tables: Tables, tiles: TileTable, world: jax.Array, seen: Seen) -> Planes:
+            return resolve(options, inputs.scene, tiles, world, tables.geoms, seen)
+
+        dtypes = {k: v for name in options.outputs for k, v in PLANES[name].items()}
+        return _in_blocks(options, inputs, kernel, dtypes)
+
+    def fused(inputs: Inputs) -> Planes:
+        tables = make_tables(options, inputs)
+        return _resolve_all(options, inputs, tables, seen_fused(options, inputs.scene, tables))
+
+    return _images(options, _by_platform(options, tiled, fused, inputs))
+
+
+def _find(options: Options, inputs: Inputs) -> Seen:
+    """What each pixel sees, [W, tiles, 144] each."""
+
+    def tiled(inputs: Inputs) -> Seen:
+        names = ("key", "shadows") if options.shadowed else ("key",)
+        planes = _in_blocks(
+            options,
+            inputs,
+            lambda tables, tiles, world, seen: {name: getattr(seen, name) for name in names},
+            dict.fromkeys(names, jnp.int32),
+        )
+        return Seen(planes["key"], planes.get("shadows"))
+
+    def fused(inputs: Inputs) -> Seen:
+        return seen_fused(options, inputs.scene, make_tables(options, inputs))
+
+    worlds = inputs.origin.shape[0]
+    seen = _by_platform(options, tiled, fused, inputs)
+    return jax.tree.map(lambda x: x.reshape(worlds, -1, x.shape[-1]), seen)
 
 
 def _by_platform(
@@ -173,179 +217,61 @@ def _by_platform(
     return (tiled if options.backend == "tiled" else fused)(inputs)
 
 
-def _draw(options: Options, inputs: Inputs) -> dict[str, jax.Array]:
-    """Images [W, H, W, ...] of W worlds."""
-
-    def tiled(inputs: Inputs) -> dict[str, jax.Array]:
-        def kernel(tables: Tables, tiles: TileTable, world: jax.Array, key: jax.Array) -> dict:
-            return _resolve(options, inputs.scene, tiles, world, tables.geoms, key)
-
-        return _in_blocks(options, inputs, kernel)
-
-    def fused(inputs: Inputs) -> dict[str, jax.Array]:
-        tables = make_tables(options, inputs)
-        key = nearest_fused(inputs.scene.types, options.stride, tables)
-        return _resolve(options, inputs.scene, tables.tiles, tables.world, tables.geoms, key)
-
-    return _images(options, _by_platform(options, tiled, fused, inputs))
-
-
-def _find(options: Options, inputs: Inputs) -> jax.Array:
-    """Keys int32 [W, tiles, 144]."""
-
-    def tiled(inputs: Inputs) -> jax.Array:
-        return _in_blocks(options, inputs, lambda tables, tiles, world, key: key)
-
-    def fused(inputs: Inputs) -> jax.Array:
-        return nearest_fused(inputs.scene.types, options.stride, make_tables(options, inputs))
-
-    key = _by_platform(options, tiled, fused, inputs)
-    return key.reshape(inputs.origin.shape[0], -1, key.shape[-1])
+def _resolve_all(options: Options, inputs: Inputs, tables: Tables, seen: Seen) -> Planes:
+    return resolve(options, inputs.scene, tables.tiles, tables.world, tables.geoms, seen)
 
 
 def _in_blocks(
     options: Options,
     inputs: Inputs,
-    kernel: Callable[[Tables, TileTable, jax.Array, jax.Array], Any],
-) -> Any:
-    """`kernel(tables, tiles, world, key)` of all tiles, block by block; its arrays are [tiles, ...]."""
-    types = inputs.scene.types
+    kernel: Callable[[Tables, TileTable, jax.Array, Seen], Planes],
+    dtypes: dict[str, Any],
+) -> Planes:
+    """`kernel(tables, tiles, world, seen)` of all tiles, block by block; [N, 144] each."""
+    worlds = inputs.origin.shape[0]
+    if worlds == 1:
+        # The compiler drops an axis of length one, then fuses and rounds the set-up differently.
+        inputs = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), inputs)
+    # Nor may it fold a constant scene, or merge what made the scene, with other roundings.
+    inputs = lax.optimization_barrier(inputs)
     tables = make_tables(options, inputs)
-    rows = hit_rows(types, tables.placed)
-    lists = words(types, touching(options, tables))
-    length = jnp.sum(lax.population_count(lists), -1).astype(jnp.int32)
-    tiles = length.shape[0]
+    lists, length, search = prepare_tiled(options, inputs.scene, tables)
+    tiles = worlds * options.rows * options.columns
+    lists, length = lists[:tiles], length[:tiles]
     blocks = -(-tiles // _BLOCK)
     size = -(-tiles // blocks)
     order = jnp.argsort(-length)
     # The last block is filled up with copies of the last tile.
-    padded = jnp.minimum(jnp.arange(blocks * size), tiles - 1)
-    source = (tables.tiles, tables.world, lists)
-    source = jax.tree.map(lambda leaf: leaf[order[padded]], source)
+    source = order[jnp.minimum(jnp.arange(blocks * size), tiles - 1)]
+    everything = jax.tree.map(lambda leaf: leaf[source], (tables.tiles, tables.world, lists))
 
-    def block(i: jax.Array, out: Any) -> Any:
-        def cut(leaf: jax.Array) -> jax.Array:
-            return lax.dynamic_slice_in_dim(leaf, i * size, size)
-
-        part, world, part_lists = jax.tree.map(cut, source)
-        key = nearest_tiled(types, options.stride, part, world, part_lists, rows)
-        values = kernel(tables, part, world, key)
+    def block(i: jax.Array, planes: Planes) -> Planes:
+        part, world, part_lists = jax.tree.map(
+            lambda leaf: lax.dynamic_slice_in_dim(leaf, i * size, size), everything
+        )
+        seen = seen_tiled(options, inputs.scene, search, part, world, part_lists)
         return jax.tree.map(
-            lambda all_, value: lax.dynamic_update_slice_in_dim(all_, value, i * size, 0), out, values
+            lambda plane, new: lax.dynamic_update_slice_in_dim(plane, new, i * size, 0),
+            planes,
+            kernel(tables, part, world, seen),
         )
 
-    spec = jax.eval_shape(
-        kernel,
-        tables,
-        *jax.tree.map(lambda leaf: leaf[:size], source[:2]),
-        jnp.zeros((size, TILE * TILE), jnp.int32),
-    )
-    start = jax.tree.map(lambda s: jnp.zeros((blocks * size, *s.shape[1:]), s.dtype), spec)
-    # The compiler must not know that this is `blocks`: a loop of one round would be dissolved, and its
-    # arithmetic merged, and rounded differently, with what surrounds it.
+    start = {name: jnp.zeros((blocks * size, TILE * TILE), dtype) for name, dtype in dtypes.items()}
+    # The compiler must not know that this is `blocks`: it would dissolve a loop of one round, and
+    # merge its arithmetic, rounded differently, with what surrounds it.
     rounds = blocks + jnp.minimum(length[0], 0)
-    out = lax.fori_loop(0, rounds, block, start)
+    planes = lax.fori_loop(0, rounds, block, start)
     place = jnp.argsort(order)
-    return jax.tree.map(lambda leaf: leaf[place], out)
+    return jax.tree.map(lambda plane: plane[place], planes)
 
 
-# -- depth, normal, colour of what was found -----------------------------------------------------------------
+def _images(options: Options, planes: Planes) -> Planes:
+    """[N, 144] -> [W, H, W]."""
 
-
-def _resolve(
-    options: Options,
-    scene: Scene,
-    tiles: TileTable,
-    world: jax.Array,
-    geoms: GeomTable,
-    key: jax.Array,
-) -> dict[str, jax.Array]:
-    """Outputs per pixel, [N, 144]; rgb as packed uint32, radiance as three channels."""
-    order = slot_order(scene.types)
-    mask = slot_mask(scene.types)
-    key = key.reshape(-1, key.shape[-1])
-    hit = key < NOTHING
-    slot = jnp.minimum(key & mask, len(order) - 1)
-    out: dict[str, Any] = {}
-    if "segmentation" in options.outputs:
-        ids = jnp.asarray([scene.ids[i] for i in order], jnp.int32)
-        out["segmentation"] = jnp.where(hit, ids[slot], -1)
-    if options.outputs == ("segmentation",):
-        return out
-    index = world[:, None] * len(order) + slot
-    u, v = pixel_coordinates(tiles, options.stride)
-    a, b, c, o = (geoms.vector(name, index) for name in "abco")
-    d = tuple(a[i] * u + (b[i] * v + c[i]) for i in range(3))
-    ranges = slot_ranges(scene.types)
-
-    def is_family(name: str) -> jax.Array:
-        slots = ranges.get(name, range(0))
-        return (slot >= slots.start) & (slot < slots.stop)
-
-    kind = Kind(is_family("cylinder"), is_family("box"), is_family("plane"))
-    near = lax.bitcast_convert_type(key & ~mask, jnp.float32)
-    near = jnp.where(hit, near, 1.0)
-    depth, point, gradient = surface(near, o, d, geoms.look_up("half", index), kind)
-    if "depth" in options.outputs:
-        out["depth"] = jnp.where(hit, depth, jnp.inf)
-    if not options.coloured:
-        return out
-    fx, fy, skew = tiles["fx"], tiles["fy"], tiles["skew"]
-    y = v / fy
-    x = (u - skew * y) / fx
-    one = jnp.ones_like(x)
-    ray = (x, y, one)
-    ga = dot(a, gradient)
-    normal = shading.normalised((fx * ga, fy * dot(b, gradient) + skew * ga, dot(c, gradient)))
-    to_eye = shading.normalised((-x, -y, -one))
-    up = tiles.vector("up")
-    rgb = geoms.vector("rgb", index)
-    kinds = texture_kinds(scene)
-    if len(kinds) > 1:
-        grid = geoms.vector("grid", index)
-        local = tuple((1 - 1e-4) * point[i] * grid[i] for i in range(3))
-        footprint = depth * geoms.look_up("frequency", index) / fx
-        weight = shading.textured(kinds, geoms.look_up("texture", index), local, footprint)
-        rgb = shading.mix(rgb, geoms.vector("second", index), weight)
-    lights = []
-    for i, directional in enumerate(scene.lights.directional):
-        towards = tiles.vector(f"light{i}_")
-        if not directional:
-            towards = shading.normalised(tuple(towards[j] - depth * ray[j] for j in range(3)))
-        lights.append((towards, tiles.vector(f"diffuse{i}_"), tiles.vector(f"specular{i}_"), None))
-    colour = shading.lit(
-        rgb,
-        geoms.look_up("specular", index),
-        geoms.look_up("shininess", index),
-        normal,
-        to_eye,
-        up,
-        tiles.vector("ambient"),
-        lights,
-    )
-    sky = shading.sky(tiles.vector("horizon"), tiles.vector("zenith"), up, ray)
-    final = [jnp.where(hit, colour[i], sky[i]) for i in range(3)]
-    final = [jnp.where(f > 0, jnp.minimum(f, 1.0), 0.0) for f in final]
-    if "radiance" in options.outputs:
-        out["radiance"] = tuple(final)
-    if "rgb" in options.outputs:
-        r, g, b_ = (jnp.floor(f * 255 + 0.5).astype(jnp.uint32) for f in final)
-        out["rgb"] = r | (g << 8) | (b_ << 16)
-    return out
-
-
-def _images(options: Options, values: dict[str, Any]) -> dict[str, jax.Array]:
-    """[N, 144] -> [W, H, W, ...]."""
-
-    def image(tiles: jax.Array) -> jax.Array:
-        grid = tiles.reshape(-1, options.rows, options.columns, TILE, TILE)
+    def image(plane: jax.Array) -> jax.Array:
+        grid = plane.reshape(-1, options.rows, options.columns, TILE, TILE)
         grid = grid.transpose(0, 1, 3, 2, 4)
         grid = grid.reshape(-1, options.rows * TILE, options.columns * TILE)
         return grid[:, : options.height, : options.width]
 
-    images = {name: jax.tree.map(image, value) for name, value in values.items()}
-    if "rgb" in images:
-        images["rgb"] = lax.bitcast_convert_type(images["rgb"], jnp.uint8)[..., :3]
-    if "radiance" in images:
-        images["radiance"] = jnp.stack(images["radiance"], -1)
-    return images
+    return jax.tree.map(image, planes)

@@ -1,8 +1,8 @@
 """What is drawn: primitives, materials, lights, background; and the window of pixels to draw.
 
-Everything that can shift between worlds is a pytree leaf; what shapes the compiled program (types, ids,
-texture kinds, which lights are directional, image sizes) is static. Single-example semantics: no batch
-axis anywhere; batch with `jax.vmap`.
+Everything that can shift between worlds is a pytree leaf; what shapes the compiled program (types,
+ids, texture kinds, which lights are directional, image sizes) is static. Single-example semantics:
+no batch axis anywhere; batch with `jax.vmap`.
 """
 
 import dataclasses
@@ -12,6 +12,10 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
+
+from palm_jax._checks import DtypeError, OptionError, ShapeError
+
+Values = ArrayLike | Sequence[Any]
 
 PRIMITIVES = ("sphere", "ellipsoid", "capsule", "cylinder", "box", "plane")
 """Names of the primitive types, as MuJoCo spells them."""
@@ -41,8 +45,9 @@ class CameraLike(Protocol):
 class Lights:
     """Light sources; make them with `make_lights`.
 
-    Each light has a position and a direction and uses one of the two: a directional light its `dir` (the
-    way the light travels, world frame), a point light its `pos` (metres). There is no fall-off.
+    Each light has a position and a direction and uses one of the two: a directional light its `dir`
+    (the way the light travels, world frame), a point light its `pos` (metres). Light does not fall
+    off with distance.
     """
 
     pos: jax.Array  # [L, 3] metres
@@ -59,11 +64,12 @@ class Lights:
 class Scene:
     """G primitives with poses, materials and ids, lights and a sky; make it with `make_scene`.
 
-    Sizes follow MuJoCo: sphere (radius, -, -), capsule and cylinder (radius, half length, -) along the
-    local z axis, ellipsoid and box half sizes, plane (half width in x, in y, -) with 0 for infinite.
-    A plane is z = 0 of its frame and is seen from the +z side only; the others are seen from outside only:
-    a camera inside one looks through it. A geom with a non-finite pose or size, or with a negative size, is
-    not seen; zero sizes count as 10 micrometres.
+    Sizes follow MuJoCo: sphere (radius, -, -), capsule and cylinder (radius, half length, -) along
+    the local z axis, ellipsoid and box half sizes, plane (half width in x, in y, -) with 0 for
+    infinite. A plane is z = 0 of its frame and is seen from the +z side only. The others are seen
+    from outside only: a camera inside one looks through it. Nothing is seen nearer than 1 mm to the
+    camera's plane. A geom with a non-finite pose or size, or with a negative size, is not seen;
+    zero sizes count as 10 micrometres.
     """
 
     pos: jax.Array  # [G, 3] metres, world
@@ -82,13 +88,15 @@ class Scene:
     textures: tuple[str, ...] = _static()
 
     def check(self) -> None:
-        """Raises ValueError where a name is unknown or a shape is wrong."""
+        """Raises OptionError where a name is unknown, ShapeError where a shape is wrong."""
         for names, known, what in (
             (self.types, PRIMITIVES, "primitive type"),
             (self.textures, TEXTURES, "texture"),
         ):
             check_names(names, known, what)
         count = len(self.types)
+        if count == 0:
+            raise OptionError("Scene.types is empty; draw at least one geom (it may be invisible)")
         _check_length("Scene.ids", self.ids, count, "Scene.types")
         _check_length("Scene.textures", self.textures, count, "Scene.types")
         shapes = {
@@ -106,9 +114,7 @@ class Scene:
         for name, shape in shapes.items():
             check_shape(f"Scene.{name}", getattr(self, name), shape)
         lamps = len(self.lights.directional)
-        _check_length(
-            "Lights.casts_shadow", self.lights.casts_shadow, lamps, "Lights.directional"
-        )
+        _check_length("Lights.casts_shadow", self.lights.casts_shadow, lamps, "Lights.directional")
         for name in ("pos", "dir", "diffuse", "specular"):
             check_shape(f"Lights.{name}", getattr(self.lights, name), (lamps, 3))
         check_shape("Lights.ambient", self.lights.ambient, (3,))
@@ -119,8 +125,8 @@ class Scene:
 class Window:
     """Which pixels of the virtual full frame to draw.
 
-    Pixel (i, j) of the result is pixel (origin[0] + stride * i, origin[1] + stride * j) of the frame. The
-    window may lie partly or wholly outside the frame: the camera's rays simply go on.
+    Pixel (i, j) of the result is pixel (origin[0] + stride * i, origin[1] + stride * j) of the
+    frame. The window may lie partly or wholly outside the frame: the camera's rays simply go on.
     """
 
     origin: jax.Array  # int32 [2] (row, column)
@@ -129,15 +135,15 @@ class Window:
     stride: int = _static(default=1)
 
     def check(self) -> None:
-        """Raises ValueError or TypeError where a field is wrong."""
+        """Raises ShapeError, DtypeError or OptionError where a field is wrong."""
         check_shape("Window.origin", self.origin, (2,))
         if not jnp.issubdtype(jnp.result_type(self.origin), jnp.integer):
-            raise TypeError(
+            raise DtypeError(
                 f"Window.origin holds whole pixels: expected an integer dtype, got "
                 f"{jnp.result_type(self.origin)}; round it and cast to int32"
             )
         for name in ("height", "width", "stride"):
-            check_positive(f"Window.{name}", getattr(self, name))
+            _check_positive(f"Window.{name}", getattr(self, name))
 
 
 @jax.tree_util.register_dataclass
@@ -153,18 +159,18 @@ class Frame:
 
 def make_lights(
     *,
-    dir: ArrayLike | None = None,
-    pos: ArrayLike | None = None,
-    diffuse: ArrayLike = 0.7,
-    specular: ArrayLike = 0.3,
-    ambient: ArrayLike = 0.3,
+    dir: Values | None = None,
+    pos: Values | None = None,
+    diffuse: Values = 0.7,
+    specular: Values = 0.3,
+    ambient: Values = 0.3,
     casts_shadow: bool | Sequence[bool] = True,
 ) -> Lights:
     """Directional lights, then point lights.
 
     Args:
-      dir: [D, 3] or [3] directions in which light travels (world); none given and no `pos`: one light
-        from above.
+      dir: [D, 3] or [3] directions in which light travels (world); with neither `dir` nor `pos`
+        there is one light from above.
       pos: [P, 3] or [3] positions of point lights, metres.
       diffuse, specular: [], [3] or [D + P, 3] intensities.
       ambient: [] or [3].
@@ -172,6 +178,9 @@ def make_lights(
 
     Returns:
       `Lights` with L = D + P.
+
+    Raises:
+      ShapeError: a shape that does not fit.
     """
     if dir is None and pos is None:
         dir = [0.3, 0.5, -1.0]
@@ -193,20 +202,20 @@ def make_lights(
 
 def make_scene(
     types: Sequence[str],
-    pos: ArrayLike,
-    mat: ArrayLike,
-    size: ArrayLike,
-    rgb: ArrayLike,
+    pos: Values,
+    mat: Values,
+    size: Values,
+    rgb: Values,
     *,
     ids: Sequence[int] | None = None,
     textures: Sequence[str] | None = None,
-    rgb2: ArrayLike | None = None,
-    texture_scale: ArrayLike = 0.1,
-    specular: ArrayLike = 0.3,
-    shininess: ArrayLike = 0.4,
-    visible: ArrayLike = True,
+    rgb2: Values | None = None,
+    texture_scale: Values = 0.1,
+    specular: Values = 0.3,
+    shininess: Values = 0.4,
+    visible: Values = True,
     lights: Lights | None = None,
-    background: ArrayLike = ((0.80, 0.86, 0.92), (0.36, 0.52, 0.74)),
+    background: Values = ((0.80, 0.86, 0.92), (0.36, 0.52, 0.74)),
 ) -> Scene:
     """A `Scene` with defaults filled in, checked.
 
@@ -221,7 +230,8 @@ def make_scene(
       background: [2, 3] sky colours at the horizon and at the zenith.
 
     Raises:
-      ValueError: an unknown type or texture, or a shape that does not fit.
+      OptionError: an unknown type or texture, or no geom at all.
+      ShapeError: a shape that does not fit.
     """
     count = len(types)
     colours = jnp.asarray(rgb, jnp.float32)
@@ -246,46 +256,50 @@ def make_scene(
 
 
 def check_names(names: Sequence[str], known: Sequence[str], what: str) -> None:
-    """Raises ValueError, listing the known names, where one of `names` is not among them."""
+    """Raises OptionError, listing the known names, where one of `names` is not among them."""
     for name in names:
         if name not in known:
-            raise ValueError(f"unknown {what} {name!r}; known: {', '.join(known)}")
+            raise OptionError(f"unknown {what} {name!r}; known: {', '.join(known)}")
 
 
 def check_shape(name: str, value: ArrayLike, shape: tuple[int, ...]) -> None:
-    """Raises ValueError where the field `name` has another shape."""
+    """Raises ShapeError where the field `name` has another shape."""
     got = jnp.shape(value)
     if got != shape:
-        raise ValueError(
-            f"{name}: expected shape {shape}, got {got}; render takes one world, batch with jax.vmap"
+        raise ShapeError(
+            f"{name}: expected shape {list(shape)}, got {list(got)}; "
+            "render takes one world, batch with jax.vmap"
         )
 
 
-def check_positive(name: str, value: object) -> None:
-    """Raises ValueError where a static size is not a whole number of at least 1."""
+def _check_positive(name: str, value: object) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ValueError(f"{name}: expected a Python int of at least 1, got {value!r}")
+        raise OptionError(f"{name}: expected a Python int of at least 1, got {value!r}")
 
 
 def _check_length(name: str, values: Sequence[object], count: int, like: str) -> None:
     if len(values) != count:
-        raise ValueError(f"{name}: expected {count} entries as in {like}, got {len(values)}")
+        raise ShapeError(f"{name}: expected {count} entries as in {like}, got {len(values)}")
 
 
-def _vectors(name: str, value: ArrayLike | None) -> jax.Array:
+def _vectors(name: str, value: Values | None) -> jax.Array:
     if value is None:
         return jnp.zeros((0, 3), jnp.float32)
     array = jnp.asarray(value, jnp.float32)
     if array.ndim not in (1, 2) or array.shape[-1] != 3:
-        raise ValueError(f"{name}: expected shape (3,) or (n, 3), got {array.shape}")
+        raise ShapeError(f"{name}: expected shape [3] or [n, 3], got {list(array.shape)}")
     return array.reshape(-1, 3)
 
 
-def _filled(name: str, value: ArrayLike, shape: tuple[int, ...]) -> jax.Array:
+def _filled(name: str, value: Values, shape: tuple[int, ...]) -> jax.Array:
     array = jnp.asarray(value, jnp.float32)
-    try:
-        return jnp.broadcast_to(array, shape)
-    except ValueError:
-        raise ValueError(
-            f"{name}: expected a shape that broadcasts to {shape}, got {array.shape}"
-        ) from None
+    if not _broadcasts(array.shape, shape):
+        raise ShapeError(
+            f"{name}: expected a shape that broadcasts to {list(shape)}, got {list(array.shape)}"
+        )
+    return jnp.broadcast_to(array, shape)
+
+
+def _broadcasts(got: tuple[int, ...], shape: tuple[int, ...]) -> bool:
+    matching = zip(reversed(got), reversed(shape), strict=False)
+    return len(got) <= len(shape) and all(a in (1, b) for a, b in matching)

@@ -1,30 +1,32 @@
 """Colours: procedural textures, lights, sky. Elementwise on tuples of arrays, as in `intersect`.
 
-Only additions, products, quotients, square roots, comparisons and integer mixing: each is correctly rounded,
-so a pixel gets the same bits wherever it sits in a vector register. (Sines and powers do not have that.)
+Only additions, products, quotients, square roots, comparisons and integer mixing: each is correctly
+rounded, so a pixel gets the same bits wherever it sits in a vector register. (Sines and powers are
+not.)
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from palm_jax.render.intersect import Vector, dot
+from palm_jax.render.intersect import Vector, dot, each
 
 
 def normalised(p: Vector) -> Vector:
     """Unit vector; zero stays zero."""
-    # Not 1 / sqrt: the compiler makes that an approximate instruction, scalar here and vector there.
+    # Not 1 / sqrt: the compiler makes that an approximate instruction, and no vector of it.
     inverse = jnp.sqrt(1 / jnp.maximum(dot(p, p), 1e-20))
     return p[0] * inverse, p[1] * inverse, p[2] * inverse
 
 
 def mix(p: Vector, q: Vector, weight: jax.Array) -> Vector:
     """p where weight is 0, q where it is 1."""
-    return tuple(x + weight * (y - x) for x, y in zip(p, q, strict=True))  # type: ignore[return-value]
+    return each(lambda i: p[i] + weight * (q[i] - p[i]))
 
 
-# -- textures: local coordinates in units of the texture's scale -> weight of the second colour, 0..1 ----
+# -- textures: local coordinates in units of the texture -> weight of the second colour, 0..1 --------
 
 
 def _hashed(x: jax.Array, y: jax.Array) -> jax.Array:
@@ -75,9 +77,7 @@ def noise(p: Vector) -> jax.Array:
 PATTERNS = {"checker": checker, "wood": wood, "noise": noise}
 
 
-def textured(
-    kinds: Sequence[str], kind: jax.Array, p: Vector, footprint: jax.Array
-) -> jax.Array:
+def textured(kinds: Sequence[str], kind: jax.Array, p: Vector, footprint: jax.Array) -> jax.Array:
     """Weight of the second colour.
 
     Args:
@@ -94,11 +94,20 @@ def textured(
     return jnp.where(kind > 0, 0.4 + sharp * (weight - 0.4), 0.0)
 
 
-# -- light ------------------------------------------------------------------------------------------------
+# -- light -----------------------------------------------------------------------------------------
+
+
+class Light(NamedTuple):
+    """One light as a pixel sees it."""
+
+    towards: Vector  # unit
+    diffuse: Vector
+    specular: Vector
+    shadowed: jax.Array | None  # bool; None where shadows are off
 
 
 def highlight(cosine: jax.Array, shininess: jax.Array) -> jax.Array:
-    """About cosine ** (128 * shininess): the square of Schlick's quotient x / (n - n x + x), no power."""
+    """About cosine ** (128 * shininess), as the square of Schlick's quotient x / (n - n x + x)."""
     x = jnp.maximum(cosine, 0)
     n = jnp.maximum(64 * shininess, 0.5)
     quotient = x / (n - n * x + x)
@@ -113,15 +122,16 @@ def lit(
     to_eye: Vector,
     up: Vector,
     ambient: Vector,
-    lights: Sequence[tuple[Vector, Vector, Vector, jax.Array | None]],
+    lights: Sequence[Light],
 ) -> Vector:
     """Blinn-Phong colour; all vectors unit, in one frame.
 
     Args:
       albedo: colour of the surface.
       specular, shininess: of the surface.
-      normal, to_eye, up: directions; `ambient` light is 0.6 times as strong from below as from above.
-      lights: for each (direction towards it, diffuse, specular, shadowed or None).
+      normal, to_eye, up: directions.
+      ambient: light from everywhere, 0.6 times as strong from below as from above.
+      lights: those that shine.
     """
     sky = 0.8 + 0.2 * dot(normal, up)
     result = [albedo[i] * (ambient[i] * sky) for i in range(3)]
@@ -141,6 +151,6 @@ def lit(
 
 
 def sky(horizon: Vector, zenith: Vector, up: Vector, ray: Vector) -> Vector:
-    """Background colour along `ray` (any length): `horizon` and below it, towards `zenith` above."""
+    """Background along `ray` (any length): `horizon` there and below, towards `zenith` above."""
     rise = jnp.clip(dot(up, ray) * jnp.sqrt(1 / dot(ray, ray)), 0, 1)
     return mix(horizon, zenith, rise * (2 - rise))

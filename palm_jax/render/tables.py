@@ -1,6 +1,6 @@
 """What the kernels read, computed once per frame: numbers per tile and numbers per geom.
 
-A kernel that reads fifty arrays is not vectorised, one that reads fifty columns of two tables is; so
+A kernel that reads fifty arrays is not vectorised, one that reads fifty columns of two tables is:
 everything a pixel needs of its world, its tile and the geom it sees is packed here.
 """
 
@@ -12,12 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from palm_jax.render.intersect import FAMILIES, Placed, Vector, components, dot, family, place
+from palm_jax.render.intersect import FAMILIES, Placed, Vector, components, family, place, turned
 from palm_jax.render.scene import TEXTURES, Scene
-from palm_jax.render.shading import normalised
 
 TILE = 12
-"""Side of a tile in pixels: 144 is a multiple of every vector width, so no ray is a scalar remainder."""
+"""Side of a tile in pixels. 144 is a multiple of all vector widths: no ray is a remainder."""
 
 
 class Options(NamedTuple):
@@ -63,39 +62,49 @@ class Inputs(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TileTable:
-    """float32 [N, C]: a row per tile, columns by name."""
+    """A row per tile: what all its pixels share. Columns by name, [N, 1] each."""
 
-    values: jax.Array
-    names: tuple[str, ...] = dataclasses.field(metadata={"static": True})
+    values: jax.Array  # float32 [N, C]
+    layout: tuple[tuple[str, int], ...] = dataclasses.field(metadata={"static": True})
 
     def __getitem__(self, name: str) -> jax.Array:
-        """Column [N, 1]."""
-        index = self.names.index(name)
-        return self.values[:, index : index + 1]
+        """The column `name`, [N, 1]."""
+        start = _starts(self.layout)[name]
+        return self.values[:, start : start + 1]
 
     def vector(self, name: str) -> Vector:
-        """Columns `name`0 .. `name`2."""
-        return self[f"{name}0"], self[f"{name}1"], self[f"{name}2"]
+        """The three columns of `name`."""
+        start = _starts(self.layout)[name]
+        x, y, z = (self.values[:, i : i + 1] for i in range(start, start + 3))
+        return x, y, z
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class GeomTable:
-    """float32 [F * W * G]: per field, all geoms of all worlds in slot order."""
+    """A row per geom of each world, in slot order; row world * G + slot."""
 
-    values: jax.Array
-    count: int = dataclasses.field(metadata={"static": True})  # W * G
-    names: tuple[str, ...] = dataclasses.field(metadata={"static": True})
+    values: jax.Array  # float32 [W * G * F], flat: a look-up is one gather of single numbers
+    layout: tuple[tuple[str, int], ...] = dataclasses.field(metadata={"static": True})
 
-    def look_up(self, name: str, index: jax.Array) -> jax.Array:
-        """The field of geom `index` (world * G + slot), any shape."""
-        start = self.names.index(name) * self.count
-        return self.values.at[start + index].get(mode="promise_in_bounds")
+    def look_up(self, name: str, row: jax.Array, part: int = 0) -> jax.Array:
+        """Number `part` of field `name` for every entry of `row`."""
+        width = sum(count for _, count in self.layout)
+        at = row * width + (_starts(self.layout)[name] + part)
+        return self.values.at[at].get(mode="promise_in_bounds")
 
-    def vector(self, name: str, index: jax.Array) -> Vector:
-        """Fields `name`0 .. `name`2."""
-        x, y, z = (self.look_up(f"{name}{i}", index) for i in range(3))
+    def vector(self, name: str, row: jax.Array) -> Vector:
+        """The three numbers of field `name`."""
+        x, y, z = (self.look_up(name, row, i) for i in range(3))
         return x, y, z
+
+
+def _starts(layout: Sequence[tuple[str, int]]) -> dict[str, int]:
+    starts, at = {}, 0
+    for name, width in layout:
+        starts[name] = at
+        at += width
+    return starts
 
 
 class Tables(NamedTuple):
@@ -108,6 +117,7 @@ class Tables(NamedTuple):
     tiles: TileTable
     world: jax.Array  # int32 [N]
     geoms: GeomTable
+    lights: jax.Array  # [W, L, 3] camera frame: unit vector towards a directional light, else place
 
 
 def slot_order(types: Sequence[str]) -> list[int]:
@@ -140,102 +150,131 @@ def pixel_offsets(stride: int) -> tuple[jax.Array, jax.Array]:
 def make_tables(options: Options, inputs: Inputs) -> Tables:
     """Everything the kernels read."""
     scene = inputs.scene
-    order = np.asarray(slot_order(scene.types))
+    kinds, geoms = _in_slot_order(scene)
     placed = place(
-        [scene.types[i] for i in order],
-        scene.pos[:, order],
-        scene.mat[:, order],
-        scene.size[:, order],
-        scene.visible[:, order],
+        kinds,
+        geoms["pos"],
+        geoms["mat"].reshape(*geoms["pos"].shape, 3),
+        geoms["size"],
+        geoms["visible"][..., 0] > 0,
         inputs.intrinsics,
         inputs.cam_to_world,
     )
     intrinsics = jnp.where(jnp.isfinite(inputs.intrinsics), inputs.intrinsics, 1.0)
     # Whole numbers and halves are exact in float32: a pixel's ray does not depend on its tile.
     step = TILE * options.stride
-    left = (inputs.origin[:, 1:] + step * jnp.arange(options.columns)).astype(jnp.float32)
-    top = (inputs.origin[:, :1] + step * jnp.arange(options.rows)).astype(jnp.float32)
-    shape = (left.shape[0], options.rows, options.columns)
-
-    def spread(value: jax.Array) -> jax.Array:
-        return jnp.broadcast_to(value, shape).reshape(-1)
-
-    columns = {"left": spread(left[:, None, :]), "top": spread(top[:, :, None])}
-    for name, value in _world_columns(options, inputs, intrinsics).items():
-        columns[name] = spread(value[:, None, None])
-    fields = _geom_fields(options, scene, order, placed)
+    left = (inputs.origin[:, 1:] + step * np.arange(options.columns)).astype(jnp.float32)
+    top = (inputs.origin[:, :1] + step * np.arange(options.rows)).astype(jnp.float32)
+    worlds, shape = left.shape[0], (left.shape[0], options.rows, options.columns)
+    lights = _lights(inputs)
+    shared, layout = _joined(_world_columns(options, inputs, intrinsics, lights))
+    corners = jnp.stack(
+        [
+            jnp.broadcast_to(left[:, None, :], shape),
+            jnp.broadcast_to(top[:, :, None], shape),
+        ],
+        -1,
+    )
+    shared = jnp.broadcast_to(shared[:, None, None, :], (*shape, shared.shape[-1]))
+    tiles = jnp.concatenate([corners, shared], -1)
+    world = np.repeat(np.arange(worlds, dtype=np.int32), options.rows * options.columns)
+    fields, geom_layout = _joined(_geom_fields(options, scene, geoms, placed))
     return Tables(
         placed,
         intrinsics,
         left,
         top,
-        TileTable(jnp.stack(list(columns.values()), -1), tuple(columns)),
-        spread(jnp.arange(shape[0])[:, None, None]),
-        GeomTable(
-            jnp.stack([field.reshape(-1) for field in fields.values()]).reshape(-1),
-            placed.ok.size,
-            tuple(fields),
-        ),
+        TileTable(tiles.reshape(-1, tiles.shape[-1]), (("left", 1), ("top", 1), *layout)),
+        jnp.asarray(world),
+        GeomTable(fields.reshape(-1), geom_layout),
+        lights,
     )
 
 
-def _named(name: str, vector: Sequence[jax.Array]) -> dict[str, jax.Array]:
-    return {f"{name}{i}": value for i, value in enumerate(vector)}
+def _joined(parts: dict[str, jax.Array]) -> tuple[jax.Array, tuple[tuple[str, int], ...]]:
+    """Arrays [..., n] side by side, and their names and widths."""
+    return jnp.concatenate(list(parts.values()), -1), tuple(
+        (name, part.shape[-1]) for name, part in parts.items()
+    )
 
 
-def _world_columns(options: Options, inputs: Inputs, k: jax.Array) -> dict[str, jax.Array]:
-    """Numbers [W] that all pixels of a world share; directions and places in the camera's frame."""
+def _lights(inputs: Inputs) -> jax.Array:
+    """[W, L, 3]: unit vectors towards directional lights, places of point lights; camera frame."""
+    lights = inputs.scene.lights
+    sun = np.asarray(lights.directional, bool)[:, None]
+    camera = inputs.cam_to_world[:, None]
+    towards = turned(
+        jnp.where(sun, -lights.dir, lights.pos - camera[..., :3, 3]), camera[..., :3, :3]
+    )
+    squares = components(towards * towards)
+    length = jnp.maximum(squares[0] + (squares[1] + squares[2]), 1e-20)[..., None]
+    return jnp.where(sun, towards * jnp.sqrt(1 / length), towards)
+
+
+def _world_columns(
+    options: Options, inputs: Inputs, k: jax.Array, lights: jax.Array
+) -> dict[str, jax.Array]:
+    """Numbers [W, n] that all pixels of a world share."""
     columns = {
-        "fx": k[:, 0, 0],
-        "fy": k[:, 1, 1],
-        "cx": k[:, 0, 2],
-        "cy": k[:, 1, 2],
-        "skew": k[:, 0, 1],
+        "fx": k[:, 0, :1],
+        "fy": k[:, 1, 1:2],
+        "cx": k[:, 0, 2:],
+        "cy": k[:, 1, 2:],
+        "skew": k[:, 0, 1:2],
     }
     if not options.coloured:
         return columns
-    scene, lights = inputs.scene, inputs.scene.lights
-    rotation = inputs.cam_to_world[:, :3, :3]
-    axes = [components(rotation[:, :, k]) for k in range(3)]
-
-    def to_camera(vectors: jax.Array) -> Vector:
-        x, y, z = (dot(components(vectors), axis) for axis in axes)
-        return x, y, z
-
-    columns |= _named("up", components(rotation[:, 2, :]))
-    columns |= _named("ambient", components(lights.ambient))
-    columns |= _named("horizon", components(scene.background[:, 0]))
-    columns |= _named("zenith", components(scene.background[:, 1]))
-    for i, directional in enumerate(lights.directional):
-        if directional:
-            towards = normalised(to_camera(-lights.dir[:, i]))
-        else:
-            towards = to_camera(lights.pos[:, i] - inputs.cam_to_world[:, :3, 3])
-        columns |= _named(f"light{i}_", towards)
-        columns |= _named(f"diffuse{i}_", components(lights.diffuse[:, i]))
-        columns |= _named(f"specular{i}_", components(lights.specular[:, i]))
+    scene = inputs.scene
+    columns["up"] = inputs.cam_to_world[:, 2, :3]
+    columns["ambient"] = scene.lights.ambient
+    columns["horizon"], columns["zenith"] = scene.background[:, 0], scene.background[:, 1]
+    for i in range(lights.shape[1]):
+        columns[f"light{i}"] = lights[:, i]
+        columns[f"diffuse{i}"] = scene.lights.diffuse[:, i]
+        columns[f"specular{i}"] = scene.lights.specular[:, i]
     return columns
 
 
+def _in_slot_order(scene: Scene) -> tuple[list[str], dict[str, jax.Array]]:
+    """Types and leaves [W, G, n] of the geoms, in slot order; one gather for all of them."""
+    order = slot_order(scene.types)
+    leaves = {}
+    for name in (
+        "pos",
+        "mat",
+        "size",
+        "rgb",
+        "rgb2",
+        "texture_scale",
+        "specular",
+        "shininess",
+        "visible",
+    ):
+        leaf = getattr(scene, name)
+        leaves[name] = leaf.reshape(*leaf.shape[:2], -1).astype(jnp.float32)
+    joined, layout = _joined(leaves)
+    joined = joined[:, np.asarray(order)]
+    starts = _starts(layout)
+    parts = {name: joined[..., starts[name] : starts[name] + width] for name, width in layout}
+    return [scene.types[i] for i in order], parts
+
+
 def _geom_fields(
-    options: Options, scene: Scene, order: np.ndarray, placed: Placed
+    options: Options, scene: Scene, geoms: dict[str, jax.Array], placed: Placed
 ) -> dict[str, jax.Array]:
-    """Numbers [W, G] of the geom that a pixel sees."""
-    fields = {}
-    for name in ("a", "b", "c", "o"):
-        fields |= _named(name, getattr(placed, name))
-    fields["half"] = placed.half
+    """Numbers [W, G, n] of the geom that a pixel sees."""
+    a, b, c = (placed.ray[..., i, :] for i in range(3))
+    fields = {"a": a, "b": b, "c": c, "eye": placed.eye, "half": placed.half[..., None]}
     if not options.coloured:
         return fields
-    fields |= _named("rgb", components(scene.rgb[:, order]))
-    fields["specular"] = scene.specular[:, order]
-    fields["shininess"] = scene.shininess[:, order]
+    for name in ("rgb", "specular", "shininess"):
+        fields[name] = geoms[name]
     kinds = texture_kinds(scene)
     if len(kinds) > 1:
-        frequency = 1 / jnp.maximum(scene.texture_scale[:, order], 1e-6)
-        code = np.asarray([kinds.index(scene.textures[i]) for i in order], np.float32)
-        fields |= _named("second", components(scene.rgb2[:, order]))
-        fields |= _named("grid", [scale * frequency for scale in placed.scale])
+        frequency = 1 / jnp.maximum(geoms["texture_scale"], 1e-6)
+        code = [kinds.index(scene.textures[i]) for i in slot_order(scene.types)]
+        fields["second"] = geoms["rgb2"]
+        fields["grid"] = placed.scale * frequency
         fields["frequency"] = frequency
-        fields["texture"] = jnp.broadcast_to(code, frequency.shape)
+        fields["texture"] = jnp.broadcast_to(np.asarray(code, np.float32)[:, None], frequency.shape)
     return fields

@@ -1,0 +1,77 @@
+"""`python -m palm_jax bench [render|physics|align|train|eval|all] [--json FILE]`.
+
+Prints one JSON: `palm_jax` has the headline figure of each benchmark that ran, `details` all that
+was measured, the rest on what and when.
+"""
+
+import argparse
+import importlib
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from benchmarks import common
+
+
+class Benchmark(NamedTuple):
+    """One benchmark: its modules, each with `run() -> dict`, and the key of its headline figure."""
+
+    modules: tuple[str, ...]  # the headline is of the first
+    headline: str
+
+
+BENCHMARKS: dict[str, Benchmark] = {
+    "render": Benchmark(("bench_lift_spam", "bench_render"), "frames_per_second"),
+    "physics": Benchmark(("bench_physics",), "steps_per_second"),
+    "align": Benchmark(("bench_align",), "images_per_second"),
+    "train": Benchmark(("bench_train",), "samples_per_second"),
+    "eval": Benchmark(("bench_eval",), "seconds"),
+}
+
+
+def collect(names: Sequence[str]) -> dict[str, Any]:
+    """Runs benchmarks; the load is that before the first."""
+    result: dict[str, Any] = {"palm_jax": {}, **common.conditions(), "details": {}}
+    for name in names:
+        benchmark, found = BENCHMARKS[name], {}
+        for module in benchmark.modules:
+            print(f"bench {name}: {module}", file=sys.stderr, flush=True)
+            start = time.perf_counter()
+            found[module] = importlib.import_module(f"benchmarks.{module}").run()
+            print(f"  {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
+        result["palm_jax"][benchmark.headline] = found[benchmark.modules[0]][benchmark.headline]
+        result["details"][name] = found
+    return result
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m palm_jax bench", description="Speed, as JSON; best on an idle machine."
+    )
+    parser.add_argument(
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help=f"any of {', '.join(BENCHMARKS)}, or all (the default)",
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the JSON there as well")
+    options = parser.parse_args(argv)
+    names = options.names or ["all"]
+    unknown = [name for name in names if name not in (*BENCHMARKS, "all")]
+    if unknown:
+        parser.error(f"unknown benchmark {unknown[0]!r}; known: {', '.join(BENCHMARKS)}, all")
+    result = collect(list(BENCHMARKS) if "all" in names else list(dict.fromkeys(names)))
+    text = json.dumps(result, indent=2)
+    if options.json:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        options.json.write_text(text + "\n")
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

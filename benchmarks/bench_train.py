@@ -1,0 +1,106 @@
+"""Speed of behaviour cloning: the training step of the CPU presets, and acting.
+
+One step = random perspective, random overlay, crop, forward, backward and Adam, from uint8 images
+in host memory: width 16, 84 px cropped to 76, batch 64. `python -m benchmarks.bench_train` prints
+JSON. Wall-clock rates mean something on an idle machine only; milliseconds of CPU time per sample
+are less sensitive to company.
+"""
+
+import json
+import resource
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from palm_jax import align
+from palm_jax.train import learner
+
+SIDE = 84
+PROPRIO_DIM = 8
+SAMPLES = 1024
+ACT_BATCHES = (1, 64, 256)
+
+
+def _cpu_seconds() -> float:
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
+
+
+def _measure(call: Callable[[], Any], *, repeats: int, items: int) -> dict[str, float]:
+    """Time `call`, which must wait for its own result, after one call that is not counted."""
+    call()
+    seconds, cpu = [], _cpu_seconds()
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - start)
+    cpu = _cpu_seconds() - cpu
+    return {
+        "per_second": items / min(seconds),
+        "per_second_median": items / float(np.median(seconds)),
+        "cpu_ms_each": 1e3 * cpu / repeats / items,
+    }
+
+
+def _data() -> learner.Batch:
+    rng = np.random.default_rng(0)
+    return learner.Batch(
+        {"front": rng.integers(0, 256, (SAMPLES, SIDE, SIDE, 3), dtype=np.uint8)},
+        rng.normal(size=(SAMPLES, PROPRIO_DIM)).astype(np.float32),
+        rng.normal(size=(SAMPLES, learner.ACTION_DIM)).astype(np.float32),
+    )
+
+
+def run(*, steps: int = 20, repeats: int = 10) -> dict[str, Any]:
+    """Measure; `samples_per_second` is the best step's, `act` maps batch sizes to images/s."""
+    config = learner.LearnerConfig(overlay_warmup_steps=0)
+    made = learner.make_learner(config, PROPRIO_DIM)
+    data, key = _data(), jax.random.key(0)
+    bank = jax.jit(align.procedural_bank, static_argnums=(1, 2))(key, 64, SIDE)
+    state = made.jitted_init(key, learner.fit_normalizer(data.proprio, data.actions))
+
+    start = time.perf_counter()
+    state, _ = jax.block_until_ready(
+        made.jitted_step(key, state, learner.take(data, np.arange(64)), bank)
+    )
+    compile_seconds = time.perf_counter() - start
+    done = 1
+
+    def step() -> None:
+        nonlocal state, done
+        indices = learner.batch_indices(key, done, SAMPLES, config.batch_size)
+        state, _ = jax.block_until_ready(
+            made.jitted_step(key, state, learner.take(data, indices), bank)
+        )
+        done += 1
+
+    training = _measure(step, repeats=steps, items=config.batch_size)
+    policy = made.policy_state(state)
+
+    def act(count: int) -> dict[str, float]:
+        images, proprio = {"front": data.images["front"][:count]}, data.proprio[:count]
+        return _measure(
+            lambda: jax.block_until_ready(made.jitted_act(key, policy, images, proprio)),
+            repeats=repeats,
+            items=count,
+        )
+
+    return {
+        "samples_per_second": training["per_second"],
+        "samples_per_second_median": training["per_second_median"],
+        "cpu_ms_per_sample": training["cpu_ms_each"],
+        "first_step_seconds": compile_seconds,
+        "act": {str(count): act(count) for count in ACT_BATCHES},
+        "width": config.width,
+        "pixels": config.crop,
+        "batch_size": config.batch_size,
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(state.params)),
+        "device": jax.devices()[0].device_kind,
+    }
+
+
+if __name__ == "__main__":
+    print(json.dumps(run(), indent=2))

@@ -1,0 +1,213 @@
+"""The arm: golden poses, C MuJoCo's kinematics, and how well commanded deltas are reached."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import worlds
+from oracles import GOLDEN, pose
+
+from palm_jax.envs import control, make
+from palm_jax.envs.base import Env
+
+TABLE = 0.752
+
+
+@pytest.fixture(scope="module")
+def env() -> Env:
+    return make("lift_spam")
+
+
+@pytest.fixture(scope="module")
+def joints(env: Env) -> np.ndarray:
+    """[32, 7] joint positions inside the limits."""
+    low, high = env.chain.limits.T
+    return np.random.default_rng(0).uniform(low, high, (32, len(low))).astype(np.float32)
+
+
+def with_arm(env: Env, q: np.ndarray) -> mujoco.MjData:
+    data = mujoco.MjData(env.mj_model)
+    for name, value in zip(env.robot.arm_joints, q, strict=True):
+        data.joint(name).qpos[0] = value
+    mujoco.mj_kinematics(env.mj_model, data)
+    mujoco.mj_comPos(env.mj_model, data)
+    return data
+
+
+def body_pose(data: mujoco.MjData, name: str) -> np.ndarray:
+    return pose(data.body(name).xmat.reshape(3, 3), data.body(name).xpos)
+
+
+def site_pose(data: mujoco.MjData, name: str) -> np.ndarray:
+    return pose(data.site(name).xmat.reshape(3, 3), data.site(name).xpos)
+
+
+def golden_panda() -> list[dict]:
+    return json.loads((GOLDEN / "fk.json").read_text())["panda"]
+
+
+@pytest.mark.parametrize("row", golden_panda())
+def test_panda_matches_an_independent_urdf(env: Env, row: dict) -> None:
+    """Last link, flange and TCP: 0.107 m along z, a turn of -45 degrees, 0.1034 m further."""
+    # The golden angles lie a little beyond the limits in places; kinematics know none.
+    data = with_arm(env, np.array(row["q"]))
+    base = body_pose(data, "robot_base")
+    link = pose(np.array(row["rot"]), np.array(row["pos"]))
+    np.testing.assert_allclose(np.linalg.inv(base) @ body_pose(data, "link7"), link, atol=2e-6)
+    flange = link @ pose(np.eye(3), np.array([0, 0, 0.107]))
+    cos = np.sqrt(0.5)
+    hand = pose(np.array([[cos, cos, 0], [-cos, cos, 0], [0, 0, 1]]), np.zeros(3))
+    tcp = flange @ hand @ pose(np.eye(3), np.array([0, 0, 0.1034]))
+    np.testing.assert_allclose(np.linalg.inv(base) @ site_pose(data, "flange"), flange, atol=2e-6)
+    np.testing.assert_allclose(np.linalg.inv(base) @ site_pose(data, "tcp"), tcp, atol=2e-6)
+    ours = control.forward_kinematics(env.chain, jnp.array(row["q"], jnp.float32)).tcp
+    np.testing.assert_allclose(ours, base @ tcp, atol=5e-6)
+
+
+def test_kinematics_and_jacobian_are_mujocos(env: Env, joints: np.ndarray) -> None:
+    forward = jax.jit(jax.vmap(lambda q: control.forward_kinematics(env.chain, q)))
+    ours = forward(joints)
+    site, arm = env.mj_model.site("tcp").id, len(env.robot.arm_joints)
+    for i, q in enumerate(joints):
+        data = with_arm(env, q)
+        linear, angular = np.zeros((2, 3, env.mj_model.nv))
+        mujoco.mj_jacSite(env.mj_model, data, linear, angular, site)
+        np.testing.assert_allclose(ours.tcp[i], site_pose(data, "tcp"), atol=5e-6)
+        expected = np.concatenate([linear, angular])[:, :arm]
+        np.testing.assert_allclose(ours.jacobian[i], expected, atol=5e-6)
+
+
+def test_tcp_frame_is_between_the_pads(env: Env, joints: np.ndarray) -> None:
+    """Origin between the finger pads, y from one to the other, z the way they point."""
+    for q in joints[:4]:
+        data = with_arm(env, q)
+        for name in env.robot.gripper_joints:
+            data.joint(name).qpos[0] = 0.03
+        mujoco.mj_kinematics(env.mj_model, data)
+        tcp = site_pose(data, "tcp")
+        left, right = (data.geom(name).xpos for name in env.robot.pads)
+        across = left - right
+        inward = tcp[:3, :3].T @ across
+        np.testing.assert_allclose(inward, [0, np.linalg.norm(across), 0], atol=1e-9)
+        middle = tcp[:3, :3].T @ ((left + right) / 2 - tcp[:3, 3])
+        np.testing.assert_allclose(middle[:2], [0, 0], atol=1e-9)
+        # The pads reach along z over the origin.
+        half = env.mj_model.geom(env.robot.pads[0]).size[2]
+        assert abs(middle[2]) < half
+        wrist = data.site("flange").xpos
+        np.testing.assert_allclose(tcp[:3, :3].T @ (tcp[:3, 3] - wrist), [0, 0, 0.1034], atol=1e-9)
+
+
+def test_home_points_down_with_the_hand_along_x(env: Env) -> None:
+    tcp = site_pose(with_arm(env, np.array(env.robot.home)), "tcp")
+    np.testing.assert_allclose(tcp[:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def region(env: Env) -> np.ndarray:
+    """[W, 4, 4] TCP poses over the whole test region, low and high, hand turned and tilted."""
+    rng = np.random.default_rng(1)
+    low, high = [0.05, -0.35, TABLE + 0.01], [0.45, 0.35, TABLE + 0.24]
+    positions = rng.uniform(low, high, (4 * worlds.WORLDS, 3)).astype(np.float32)
+    yaws = rng.uniform(-1.0, 1.0, len(positions)).astype(np.float32)
+    return np.asarray(jax.vmap(control.pointing_down)(positions, yaws))
+
+
+def test_reach_finds_every_pose_of_the_region(env: Env, region: np.ndarray) -> None:
+    """Start poses are exact: C MuJoCo's TCP is within 0.1 mm and 0.02 degrees of what was asked."""
+    reach = jax.jit(jax.vmap(lambda target: control.reach(env.chain, env.chain.home, target)))
+    for q, target in zip(np.asarray(reach(region)), region, strict=True):
+        found = site_pose(with_arm(env, q), "tcp")
+        np.testing.assert_allclose(found[:3, 3], target[:3, 3], atol=1e-4)
+        np.testing.assert_allclose(found[:3, :3], target[:3, :3], atol=4e-4)
+
+
+def deltas(count: int) -> np.ndarray:
+    """[count, 10] actions: up to 15 mm and 5 degrees in any direction, the gripper open."""
+    rng = np.random.default_rng(2)
+    moves, axes = rng.normal(size=(2, count, 3))
+    moves *= rng.uniform(0.005, 0.015, (count, 1)) / np.linalg.norm(moves, axis=1, keepdims=True)
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    angles = np.radians(rng.uniform(0, 5, count))
+    actions = []
+    for move, axis, angle in zip(moves, axes, angles, strict=True):
+        quaternion, matrix = np.zeros(4), np.zeros(9)
+        mujoco.mju_axisAngle2Quat(quaternion, axis, angle)
+        mujoco.mju_quat2Mat(matrix, quaternion)
+        rotation = matrix.reshape(3, 3)
+        actions.append(np.concatenate([rotation[:, 0], rotation[:, 1], move, [1.0]]))
+    return np.array(actions, np.float32)
+
+
+def reached_share(region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Share of each commanded translation that one control step covers, and rotation errors in rad.
+
+    The share is 1 minus the remaining distance over the commanded one.
+    """
+    runner = worlds.runner("lift_spam")
+    env = runner.env
+    params, actions = worlds.params(env), deltas(len(region))
+    reach = jax.jit(jax.vmap(lambda target: control.reach(env.chain, env.chain.home, target)))
+    shares, turns = [], []
+    for first in range(0, len(region), worlds.WORLDS):
+        rows = slice(first, first + worlds.WORLDS)
+        state = runner.reset(worlds.keys(first), params)
+        qpos = np.array(state.data.qpos)
+        qpos[:, env._arm_qpos] = reach(region[rows])
+        qpos[:, env._ids.qpos : env._ids.qpos + 2] = (-0.8, 0.6)  # the can is out of the way
+        state = runner.restore(
+            jnp.asarray(qpos),
+            state.data.mocap_pos,
+            state.data.mocap_quat,
+            state.camera_to_world,
+            params,
+        )
+        after = runner.step(state, jnp.asarray(actions[rows]), params)
+        before, now = worlds.tcp(env, state), worlds.tcp(env, after)
+        for action, start, end in zip(actions[rows], before, now, strict=True):
+            first_column, second_column = action[:3], action[3:6]
+            turn = np.stack(
+                [first_column, second_column, np.cross(first_column, second_column)], -1
+            )
+            target = start @ pose(turn, action[6:9])
+            left = np.linalg.norm(target[:3, 3] - end[:3, 3])
+            shares.append(1 - left / np.linalg.norm(action[6:9]))
+            trace = np.trace(target[:3, :3].T @ end[:3, :3])
+            turns.append(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+    return np.array(shares), np.array(turns)
+
+
+@pytest.mark.slow
+def test_a_commanded_delta_is_reached_within_one_step(region: np.ndarray) -> None:
+    shares, turns = reached_share(region)
+    assert np.median(shares) >= 0.9, np.percentile(shares, [0, 10, 50, 90])
+    assert shares.min() >= 0.7, np.percentile(shares, [0, 10, 50, 90])
+    assert np.degrees(np.percentile(turns, 90)) < 1.5, np.degrees(np.percentile(turns, [50, 90]))
+
+
+def test_speed_limit_of_the_expert() -> None:
+    """`step_towards` covers half of a small error, and never more than its limits."""
+    start = pose(np.diag([1.0, -1.0, -1.0]), np.array([0.2, 0.1, 1.0]))
+    for distance, covered in ((0.004, 0.002), (0.1, 0.01)):
+        target = start.copy()
+        target[0, 3] += distance
+        moved = np.asarray(control.step_towards(jnp.asarray(start), jnp.asarray(target)))
+        np.testing.assert_allclose(moved[:3, 3] - start[:3, 3], [covered, 0, 0], atol=1e-6)
+        np.testing.assert_allclose(moved[:3, :3], start[:3, :3], atol=1e-6)
+    cos, sin = np.cos(1.0), np.sin(1.0)
+    turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
+    turned = pose(turn @ start[:3, :3], start[:3, 3])
+    moved = np.asarray(control.step_towards(jnp.asarray(start), jnp.asarray(turned)))
+    relative = moved[:3, :3] @ start[:3, :3].T
+    np.testing.assert_allclose(np.arctan2(relative[1, 0], relative[0, 0]), 0.07, atol=1e-5)
+
+
+def test_joints_stay_inside_their_limits(env: Env) -> None:
+    """Out of reach is no failure: the nearest pose that the iterations find, inside the limits."""
+    far = jnp.asarray(pose(np.eye(3), np.array([3.0, 0.0, 0.2])), jnp.float32)
+    q = np.asarray(control.reach(env.chain, jnp.asarray(env.chain.home), far))
+    assert np.isfinite(q).all()
+    assert (q >= env.chain.limits[:, 0] - 1e-6).all() and (q <= env.chain.limits[:, 1] + 1e-6).all()

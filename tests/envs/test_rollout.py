@@ -1,0 +1,239 @@
+"""Bulk episodes: the two executions agree, nothing is compiled twice, and the contract holds."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+from contracts import check_env, compilations
+
+from palm_jax.align import Aligned, AlignSpec
+from palm_jax.envs import make, physics, shifts
+from palm_jax.envs.rollout import Runner, scan_episodes
+from palm_jax.train.evaluate import Evaluator
+from palm_jax.train.learner import LearnerConfig, Normalizer, Range, make_learner
+from palm_jax.train.methods import find
+
+
+def steer(key: jax.Array, images: jax.Array, proprio: jax.Array) -> jax.Array:
+    """A deterministic policy [B, 10] that depends on everything it sees, smoothly."""
+    del key
+    colour = images.astype(jnp.float32).mean((1, 2)) / 255 - 0.5
+    rotation = jnp.tile(jnp.array([1.0, 0, 0, 0, 1.0, 0]), (len(images), 1))
+    move = 0.01 * (colour + 0.3 * proprio[:, :3])
+    closed = jnp.zeros((len(images), 1))
+    return jnp.concatenate([rotation, move, closed], -1)
+
+
+@pytest.mark.slow
+def test_one_scan_gives_the_runners_episodes() -> None:
+    """Outcomes are equal, and the states that the policy sees agree to rounding."""
+    runner, horizon = worlds.runner("lift_spam"), 6
+    params = worlds.params(runner.env, "workspace+viewpoint")
+    seen: list[Any] = []
+
+    def look(images: jax.Array, proprio: jax.Array) -> None:
+        seen.append((np.asarray(images), np.asarray(proprio)))
+
+    def act(key: jax.Array, images: jax.Array, proprio: jax.Array) -> jax.Array:
+        jax.debug.callback(look, images, proprio, ordered=True)
+        return steer(key, images, proprio)
+
+    def scanned(key: jax.Array, keys: jax.Array, params: Any) -> Any:
+        return scan_episodes(runner.env, key, keys, params, act, worlds.SPEC, horizon=horizon)
+
+    one = runner.run(
+        jax.random.key(0), worlds.keys(20), params, act, worlds.SPEC, horizon=horizon
+    )
+    jax.effects_barrier()
+    of_runner, seen = seen, []
+    other = physics.jit_physics(scanned)(jax.random.key(0), worlds.keys(20), params)
+    jax.effects_barrier()
+    for name, left, right in zip(one._fields, one, other, strict=True):
+        np.testing.assert_allclose(left, right, atol=1e-5, err_msg=name)
+    assert len(of_runner) == len(seen) == horizon
+    for t, (left, right) in enumerate(zip(of_runner, seen, strict=True)):
+        np.testing.assert_allclose(left[1], right[1], atol=1e-4, err_msg=f"step {t}")
+        # An edge may move by a pixel, and few pixels are edges.
+        off = np.abs(left[0].astype(int) - right[0]).max(-1) > 3
+        assert off.mean() < 0.005, t
+    assert np.abs(seen[-1][1] - seen[0][1]).max() > 0.005  # something moved
+
+
+def test_the_expert_as_a_policy_is_stopped_when_all_have_ended() -> None:
+    """`run` latches lengths, ends early, and shows every state to `watch`."""
+    runner = worlds.runner("lift_spam")
+    params = worlds.params(runner.env, "workspace")
+    states: list[Any] = []
+
+    def act(key: jax.Array, images: jax.Array, proprio: jax.Array) -> jax.Array:
+        return runner.expert(states[-1])
+
+    found = runner.run(
+        jax.random.key(0), worlds.keys(100), params, act, worlds.SPEC, watch=states.append
+    )
+    recorded = worlds.expert_episodes("lift_spam")[0]
+    np.testing.assert_array_equal(found.success, recorded.success[-1])
+    expected = np.where(
+        recorded.success[-1], recorded.success.argmax(0), runner.env.task.horizon
+    )
+    np.testing.assert_array_equal(found.length, expected)
+    if recorded.success[-1].all():
+        assert len(states) == found.length.max() + 1 < runner.env.task.horizon
+    np.testing.assert_allclose(found.object_xy, recorded.object_start[0, :, :2], atol=1e-6)
+    assert not found.nan.any() and found.seen.all()
+
+
+def test_batches_beyond_the_cliff_are_refused() -> None:
+    env = worlds.runner("lift_spam").env
+    for count in (0, physics.MAX_CPU_WORLDS + 1):
+        if jax.default_backend() == "cpu":
+            with pytest.raises(ValueError, match=f"expected 1 to 128 worlds .* got {count}"):
+                Runner(env, count)
+
+
+def untrained(runner: Runner) -> tuple[Evaluator, Any]:
+    """The evaluator of a tiny policy, and its parameters."""
+    method = find("palm")
+    spec = method.spec(runner.env.task, 84)
+    config = LearnerConfig(width=2, crop=76, embed=4, hidden=(8,))
+    learner = make_learner(config, spec.proprio_size)
+    ranges = [
+        Range(jnp.full(n, -0.01), jnp.full(n, 0.01)) for n in (spec.proprio_size, 10)
+    ]
+    state = jax.jit(learner.init)(jax.random.key(0), Normalizer(*ranges))
+    return Evaluator(runner, method, learner, 84), learner.policy_state(state)
+
+
+@pytest.mark.slow
+def test_four_domains_compile_each_piece_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A domain is data: after the first one nothing is compiled, whatever shifts."""
+    runner = worlds.runner("lift_spam")
+    short = dataclasses.replace(runner.env.task, horizon=3)
+    monkeypatch.setattr(runner.env, "task", short)
+    evaluator, policy = untrained(runner)
+    count = worlds.WORLDS + 3  # one whole batch, and one that is filled up
+    pieces: list[list[str]] = []
+    for domain in shifts.DOMAINS:
+        with compilations() as names:
+            record = evaluator.domain(policy, domain, seed=0, count=count, aligned=True)
+        pieces.append([name for name in names if name in PIECES])
+        assert record.success.shape == (count,) and not record.nan.any()
+        assert (record.length == 3).all()
+    assert len(pieces[0]) == len(set(pieces[0])), pieces[0]
+    assert not any(pieces[1:]), pieces
+
+
+PIECES = {"step", "place", "locate", "reposition", "observe", "act"}
+
+
+def test_piece_names_are_those_that_are_compiled() -> None:
+    """The budget above counts something."""
+    env = make("lift_spam")
+    runner = Runner(env, worlds.WORLDS + 1)
+    with compilations() as names:
+        params = shifts.shifted(env.default_params(), "workspace")
+        keys = jax.random.split(jax.random.key(0), worlds.WORLDS + 1)
+        runner._place(keys, jax.tree.map(lambda x: jnp.stack([x] * len(keys)), params))
+    assert names.count("place") == 1, names
+
+
+@pytest.mark.parametrize("task", worlds.TASKS)
+def test_environments_keep_the_contract(task: str) -> None:
+    check_env(worlds.runner(task), jax.random.key(30), worlds.SPEC)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ToyState:
+    x: jax.Array  # [3]
+    step: jax.Array  # int32 []
+
+
+class Toy:
+    """The smallest environment that keeps the contract; `fault` breaks one promise."""
+
+    action_size = 10
+
+    def __init__(self, fault: str = "") -> None:
+        self.fault = fault
+        self.calls = 0
+
+    def default_params(self) -> jax.Array:
+        return jnp.ones(2)
+
+    def place(self, key: jax.Array, params: jax.Array) -> ToyState:
+        self.calls += 1
+        x = jax.random.normal(key, (3,))
+        return ToyState(x * 0 if self.fault == "same worlds" else x, jnp.zeros((), jnp.int32))
+
+    def locate(self, state: ToyState, params: jax.Array) -> ToyState:
+        return state
+
+    def reposition(self, key: jax.Array, state: ToyState, params: jax.Array) -> ToyState:
+        return state
+
+    expert = restore = None
+
+    def step(self, state: ToyState, action: jax.Array, params: jax.Array) -> ToyState:
+        x = state.x + action[6:9]
+        if self.fault == "nan":
+            x = jnp.where(state.step == 2, jnp.nan, x)
+        if self.fault == "dtype":
+            return ToyState(x, (state.step + 1).astype(jnp.float32))
+        return ToyState(x, state.step + 1)
+
+    def observe(self, state: ToyState, params: Any, spec: AlignSpec, *, frame: int) -> Aligned:
+        image = jnp.clip(128 + 40 * state.x, 0, 255)
+        image = jnp.broadcast_to(image, (spec.size, spec.size, 3))
+        dtype = jnp.float32 if self.fault == "image" else jnp.uint8
+        return Aligned(image.astype(dtype), state.x, jnp.ones((), bool))
+
+
+class Forgetful(Runner):
+    """Compiles its step anew at every call."""
+
+    def __init__(self, env: Any, worlds: int) -> None:
+        super().__init__(env, worlds)
+        self.step = lambda *arguments: jax.jit(jax.vmap(env.step))(*arguments)
+
+
+class Unseeded(Runner):
+    """Draws other scenes from the same key."""
+
+    def reset(self, keys: jax.Array, params: Any) -> Any:
+        self.count = getattr(self, "count", -1) + 1
+        return super().reset(jax.vmap(lambda k: jax.random.fold_in(k, self.count))(keys), params)
+
+
+def toy(fault: str, kind: type[Runner] = Runner) -> Runner:
+    env: Any = Toy(fault)
+    return kind(env, 4)
+
+
+SMALL = AlignSpec(crop=8, size=8)
+
+
+def test_a_sound_toy_passes() -> None:
+    check_env(toy(""), jax.random.key(0), SMALL)
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "message"),
+    [
+        ("nan", Runner, "not finite after step 2"),
+        ("dtype", Runner, "shapes or dtypes change"),
+        ("image", Runner, "float32"),
+        ("same worlds", Runner, "worlds look the same"),
+        ("", Forgetful, "compiled"),
+        ("", Unseeded, "two resets with one key differ"),
+    ],
+)
+def test_broken_environments_are_found_out(
+    fault: str, kind: type[Runner], message: str
+) -> None:
+    with pytest.raises(AssertionError, match=message):
+        check_env(toy(fault, kind), jax.random.key(0), SMALL)
