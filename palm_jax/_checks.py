@@ -7,6 +7,7 @@ it returns for bad values instead. Every message says what was expected, what ca
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -16,6 +17,10 @@ from jax.typing import ArrayLike
 
 # Rotations from float32 physics drift by about 1e-5; a scaled or mistyped matrix is off by more.
 ROTATION_TOLERANCE = 1e-3
+
+
+# What functions take for a short vector such as (u, v).
+Vector = ArrayLike | Sequence[float]
 
 
 class ShapeError(ValueError):
@@ -47,7 +52,7 @@ def is_concrete(tree: Any) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def as_float(value: ArrayLike, name: str, trailing: tuple[int, ...]) -> jax.Array:
+def as_float(value: Vector, name: str, trailing: tuple[int, ...]) -> jax.Array:
     """`value` as float32 with the last axes equal to `trailing` (raises ShapeError)."""
     array = jnp.asarray(value, jnp.float32)
     rank = len(trailing)
@@ -59,7 +64,7 @@ def as_float(value: ArrayLike, name: str, trailing: tuple[int, ...]) -> jax.Arra
     return array
 
 
-def as_single(value: ArrayLike, name: str, shape: tuple[int, ...]) -> jax.Array:
+def as_single(value: Vector, name: str, shape: tuple[int, ...]) -> jax.Array:
     """`value` as float32 of exactly `shape` (raises ShapeError)."""
     array = jnp.asarray(value, jnp.float32)
     if array.shape != shape:

@@ -64,7 +64,7 @@ def compilations() -> Iterator[list[str]]:
 
     def note(event: str, seconds: float, **details: Any) -> None:
         if event == "/jax/core/compile/backend_compile_duration":
-            names.append(str(details.get("fun_name")))
+            names.append(str(details.get("fun_name")).removeprefix("jit(").removesuffix(")"))
 
     jax.monitoring.register_event_duration_secs_listener(note)
     try:

@@ -66,25 +66,25 @@ class Config:
     resume: bool = False
     robot: str = "panda"
     data: Path | None = None
-    demos: int = 60
+    demos: int = 100
     demo_seed: int = 0
     demo_noise: float = 0.004
-    image_size: int = 84
-    random_crop: int = 76
+    image_size: int = 64
+    random_crop: int = 58
     width: int = 16
     norm: str = "group"
-    steps: int = 1200
-    batch_size: int = 64
+    steps: int = 2400
+    batch_size: int = 32
     learning_rate: float = 1e-3
     schedule: str = "cosine"
     warmup_steps: int = 100
     weight_decay: float = 0.0
     ema: float = 0.99
-    overlay_warmup: int = 200
+    overlay_warmup: int = 800
     perspective: float = 0.1
     backgrounds: Path | None = None
-    checkpoint_every: int = 400
-    select_from: float = 0.6
+    checkpoint_every: int = 600
+    select_from: float = 0.7
     select_scenes: int = 24
     keep: int = 3
     scenes: int = 24
@@ -153,11 +153,14 @@ def cpu() -> Config:
         Config(),
         preset="cpu",
         demos=200,
-        steps=4000,
-        checkpoint_every=500,
+        image_size=84,
+        random_crop=76,
+        steps=3000,
+        checkpoint_every=750,
+        select_from=0.45,
         select_scenes=50,
         scenes=50,
-        overlay_warmup=500,
+        overlay_warmup=1000,
     )
 
 
@@ -171,7 +174,10 @@ def paper() -> Config:
         Config(),
         preset="paper",
         demos=200,
+        image_size=84,
+        random_crop=76,
         width=64,
+        batch_size=64,
         norm="batch",
         learning_rate=1e-4,
         schedule="constant",

@@ -464,7 +464,7 @@ def make_learner(
             "grad_norm": grad_norm,
             "param_norm": jnp.linalg.norm(flat),
             "update_norm": jnp.linalg.norm(updates),
-            "learning_rate": jnp.asarray(schedule(state.step), jnp.float32),
+            "learning_rate": jnp.asarray(schedule(state.step - state.skipped), jnp.float32),
             "skipped": skipped,
         }
         state = TrainState(

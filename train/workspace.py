@@ -114,12 +114,13 @@ def _processor() -> str:
 
 def _commit() -> str | None:
     try:
+        # Without cwd and close_fds Python spawns instead of forking, which JAX's threads forbid.
         found = subprocess.run(
-            ["git", "describe", "--always", "--dirty"],
-            cwd=Path(__file__).parent,
+            ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"],
             capture_output=True,
             text=True,
             check=True,
+            close_fds=False,
         )
     except (OSError, subprocess.CalledProcessError):
         return None

@@ -21,6 +21,7 @@ from palm_jax._checks import (
     OptionError,
     ProjectionError,
     ShapeError,
+    Vector,
     as_float,
     as_single,
     check_intrinsics,
@@ -108,7 +109,7 @@ class Camera:
         check_pose(self.cam_to_world, "Camera.cam_to_world")
         return self
 
-    def rotated_about(self, center: ArrayLike, angle: ArrayLike) -> Camera:
+    def rotated_about(self, center: Vector, angle: ArrayLike) -> Camera:
         """The camera carried round the world z axis through `center`, looking along with it.
 
         Args:
@@ -139,7 +140,7 @@ class Camera:
             max(1, round(self.width * horizontal)),
         )
 
-    def cropped(self, origin_uv: ArrayLike, height: int, width: int) -> Camera:
+    def cropped(self, origin_uv: Vector, height: int, width: int) -> Camera:
         """The camera of a window of the image: the principal point moves by -origin_uv.
 
         Args:
@@ -184,7 +185,7 @@ def _project(camera: Camera, points: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(ahead[..., None], uv, OFF_IMAGE), depth
 
 
-def project(camera: Camera, points: ArrayLike) -> tuple[jax.Array, jax.Array]:
+def project(camera: Camera, points: Vector) -> tuple[jax.Array, jax.Array]:
     """Image points of world points: K inv(cam_to_world) p, divided by the depth (PALM, eq. 1).
 
     Args:
@@ -213,7 +214,7 @@ def _rays(camera: Camera, uv: jax.Array) -> jax.Array:
     return matmul(local, jnp.asarray(camera.cam_to_world, jnp.float32)[:3, :3].T)
 
 
-def unproject(camera: Camera, uv: ArrayLike, depth: ArrayLike) -> jax.Array:
+def unproject(camera: Camera, uv: Vector, depth: ArrayLike) -> jax.Array:
     """World points [..., 3] seen at uv [..., 2] (pixels) and depth [...] (metres along z).
 
     The inverse of `project` for points in front of the camera.
@@ -228,7 +229,7 @@ def unproject(camera: Camera, uv: ArrayLike, depth: ArrayLike) -> jax.Array:
     return origin + depth[..., None] * _rays(camera, uv)
 
 
-def unproject_to_height(camera: Camera, uv: ArrayLike, z: ArrayLike) -> jax.Array:
+def unproject_to_height(camera: Camera, uv: Vector, z: ArrayLike) -> jax.Array:
     """Where the rays through uv [..., 2] (pixels) meet the horizontal planes at z [...] (metres).
 
     Used to place an object of known height from its mask's centroid (the global policy).

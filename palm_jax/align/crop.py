@@ -5,7 +5,6 @@ Images are HWC, uint8 or float32 in [0, 1]; the dtype is kept. (u, v) is in pixe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -17,6 +16,7 @@ from jax.typing import ArrayLike
 from palm_jax._checks import (
     OptionError,
     ProjectionError,
+    Vector,
     as_image,
     as_single,
     check_choice,
@@ -29,7 +29,7 @@ BORDERS = ("shift", "edge", "constant")
 NOWHERE = -(2**24)
 
 
-def crop_origin(uv: jax.Array, size: int, offset: ArrayLike | Sequence[float]) -> jax.Array:
+def crop_origin(uv: jax.Array, size: int, offset: Vector) -> jax.Array:
     """int32 [2] (row, col) of the unclamped window of `size` pixels for a TCP at uv [2].
 
     A coordinate that is not finite counts as 0, so that the integer is defined.
@@ -77,10 +77,10 @@ def cut_window(
 
 def tcp_crop(
     image: ArrayLike,
-    uv: ArrayLike,
+    uv: Vector,
     size: int,
     *,
-    offset: ArrayLike | Sequence[float] = (0, 0),
+    offset: Vector = (0, 0),
     border: str = "shift",
 ) -> jax.Array:
     """Square window of the image round the projected TCP (PALM, TCP-centric crop).

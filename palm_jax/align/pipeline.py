@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from palm_jax._checks import (
     OptionError,
     ShapeError,
+    Vector,
     as_image,
     as_single,
     check_choice,
@@ -140,7 +141,7 @@ class Aligned:
         return iter((self.image, self.proprio))
 
 
-def _jittered(points: drawing.Points, jitter: ArrayLike | None) -> drawing.Points:
+def _jittered(points: drawing.Points, jitter: Vector | None) -> drawing.Points:
     if jitter is None:
         return points
     return dataclasses.replace(points, uv=points.uv + jnp.asarray(jitter, jnp.float32))
@@ -158,8 +159,8 @@ def _align(
     tcp: jax.Array,
     opening: jax.Array,
     spec: AlignSpec,
-    crop_jitter: ArrayLike | None,
-    overlay_jitter: ArrayLike | None,
+    crop_jitter: Vector | None,
+    overlay_jitter: Vector | None,
 ) -> Aligned:
     uv, valid = _seen(camera, tcp)
     rows, columns = jnp.arange(camera.height), jnp.arange(camera.width)
@@ -185,8 +186,8 @@ def align(
     opening: ArrayLike,
     spec: AlignSpec,
     *,
-    crop_jitter: ArrayLike | None = None,
-    overlay_jitter: ArrayLike | None = None,
+    crop_jitter: Vector | None = None,
+    overlay_jitter: Vector | None = None,
 ) -> Aligned:
     """Turn a camera image and a TCP pose into a policy's input (PALM, perception alignment).
 
@@ -234,7 +235,7 @@ def window_origin(
     tcp: ArrayLike,
     spec: AlignSpec,
     *,
-    jitter: ArrayLike | None = None,
+    jitter: Vector | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Which window of the scaled frame to render for a TCP.
 
@@ -269,12 +270,12 @@ def window_origin(
 def align_window(
     image: ArrayLike,
     view_camera: cam.Camera,
-    origin: ArrayLike,
+    origin: Vector,
     tcp: ArrayLike,
     opening: ArrayLike,
     spec: AlignSpec,
     *,
-    jitter: ArrayLike | None = None,
+    jitter: Vector | None = None,
 ) -> Aligned:
     """`align` for an image that was rendered as the policy's window: overlay and proprioception.
 

@@ -175,8 +175,8 @@ def larger(p: jax.Array, q: jax.Array) -> jax.Array:
 
 
 def _ellipsoid_columns(q: Placed) -> jax.Array:
-    # |direction|^2 and the discriminant, |direction|^2 - |eye x direction|^2, are quadratic forms in
-    # (u, v, 1). The cross product loses no digits where the camera is far; the textbook's b^2 - a c would.
+    # |direction|^2 and the discriminant |direction|^2 - |eye x direction|^2 are quadratic in u, v.
+    # The cross product loses no digits where the camera is far; the textbook's b^2 - a c would.
     ox, oy, oz = (q.eye[..., i, None] for i in range(3))
     dx, dy, dz = components(q.ray)
     moment = (oy * dz - oz * dy, oz * dx - ox * dz, ox * dy - oy * dx)

@@ -155,9 +155,7 @@ class Search(NamedTuple):
 
     hit_rows: list[jax.Array]  # per group [W * (g + 1), F]
     shadow_rows: dict[int, list[jax.Array]]  # the same for every light that casts shadows
-    boxes: (
-        jax.Array
-    )  # [W, G, 15] bounding boxes: centre, three unit axes (camera frame), half sizes
+    boxes: jax.Array  # [W, G, 15] bounding boxes, camera frame: centre, unit axes, half sizes
     ok: jax.Array  # bool [W, G]
 
 
@@ -252,7 +250,7 @@ def _nearest_fused(options: Options, types: Sequence[str], tables: Tables) -> ja
 # -- shadows ---------------------------------------------------------------------------------------
 #
 # From the point that a pixel sees towards each light. The point's own geom is left out: it is
-# convex, so it never shades the side that faces the light, and no margin against rounding is needed.
+# convex, so it never shades the side that faces the light, and no margin for rounding is needed.
 
 
 def _shadow_columns(placed: Placed, tables: Tables, light: int, directional: bool) -> jax.Array:

@@ -32,7 +32,7 @@ from palm_jax.render.scene import (
 )
 from palm_jax.render.tables import TILE, Inputs, Options, Tables, TileTable, make_tables
 
-_BLOCK = 512  # tiles taken together: 74 thousand pixels
+_BLOCK = 256  # tiles taken together: 37 thousand pixels
 _BACKENDS = ("auto", "tiled", "fused")
 
 Planes = dict[str, jax.Array]

@@ -34,10 +34,21 @@ def _static(**options: Any) -> Any:
 class CameraLike(Protocol):
     """What `render` reads of a camera; `palm_jax.align.Camera` is one."""
 
-    K: jax.Array  # [3, 3] intrinsics, pixels
-    cam_to_world: jax.Array  # [4, 4] pose, axes x right, y down, z forward
-    height: int
-    width: int
+    @property
+    def K(self) -> ArrayLike:
+        """[3, 3] intrinsics, pixels."""
+
+    @property
+    def cam_to_world(self) -> ArrayLike:
+        """[4, 4] pose, axes x right, y down, z forward."""
+
+    @property
+    def height(self) -> int:
+        """Rows of the full frame."""
+
+    @property
+    def width(self) -> int:
+        """Columns of the full frame."""
 
 
 @jax.tree_util.register_dataclass

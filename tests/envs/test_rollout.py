@@ -160,15 +160,13 @@ class Toy:
 
     def __init__(self, fault: str = "") -> None:
         self.fault = fault
-        self.calls = 0
 
     def default_params(self) -> jax.Array:
         return jnp.ones(2)
 
     def place(self, key: jax.Array, params: jax.Array) -> ToyState:
-        self.calls += 1
         x = jax.random.normal(key, (3,))
-        return ToyState(x * 0 if self.fault == "same worlds" else x, jnp.zeros((), jnp.int32))
+        return ToyState(x, jnp.zeros((), jnp.int32))
 
     def locate(self, state: ToyState, params: jax.Array) -> ToyState:
         return state
@@ -176,7 +174,10 @@ class Toy:
     def reposition(self, key: jax.Array, state: ToyState, params: jax.Array) -> ToyState:
         return state
 
-    expert = restore = None
+    def expert(self, state: ToyState) -> jax.Array:
+        return jnp.zeros(10)
+
+    restore = expert
 
     def step(self, state: ToyState, action: jax.Array, params: jax.Array) -> ToyState:
         x = state.x + action[6:9]
@@ -187,7 +188,7 @@ class Toy:
         return ToyState(x, state.step + 1)
 
     def observe(self, state: ToyState, params: Any, spec: AlignSpec, *, frame: int) -> Aligned:
-        image = jnp.clip(128 + 40 * state.x, 0, 255)
+        image = jnp.clip(128 + 40 * state.x, 0, 255) * (self.fault != "same worlds")
         image = jnp.broadcast_to(image, (spec.size, spec.size, 3))
         dtype = jnp.float32 if self.fault == "image" else jnp.uint8
         return Aligned(image.astype(dtype), state.x, jnp.ones((), bool))
