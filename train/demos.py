@@ -205,6 +205,7 @@ def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None
     expected = {"format": FORMAT, "version": VERSION, "task": task, "robot": robot}
     for name, value in expected.items():
         found = data.attrs.get(name)
+        found = found.item() if isinstance(found, np.generic) else found  # readable in a message
         if found != value:
             raise DemoFileError(f"{path}: expected {name} {value!r}, found {found!r}")
     demos = [data[f"demo_{i}"] for i in range(len(data))]

@@ -406,7 +406,7 @@ def sample_distribution(
             Patch(fill=False, edgecolor=TEST_REGION, label="test bounds"),
         ],
         loc="outside lower center",
-        ncols=4,
+        ncols=4 if len(records) > 1 else 2,  # one column of axes is too narrow for four
     )
     if title:
         figure.suptitle(title, x=0.01, ha="left", fontweight="bold", fontsize=11)

@@ -274,7 +274,9 @@ def _evaluate(config: Config, evaluator: Evaluator, folder: Path, console: Conso
     records.save_eval(folder / "eval.npz", results[chosen])
     variants = {name: records.counts(domains) for name, domains in results.items()}
     write_json(folder / "eval_variants.json", {"quoted": chosen, **variants})
-    _film(config, evaluator, {d: t for (v, d), t in traces.items() if v == chosen}, folder)
+    # A domain whose camera does not turn was run in the first variant only.
+    shown = {d: t for (v, d), t in traces.items() if v == chosen or "viewpoint" not in d}
+    _film(config, evaluator, shown, folder)
     # Written last: its presence says that the method is finished.
     write_json(folder / "eval.json", variants[chosen])
 
@@ -343,7 +345,8 @@ def _gallery(folders: dict[str, Path], out: Path) -> None:
         path = folder / "views.npz"
         if path.exists():
             with np.load(path) as views:
-                inputs[name], frames = _views(views, "input/"), _views(views, "frame/")
+                inputs[name] = _views(views, "input/")
+                frames |= _views(views, "frame/")
     if inputs:
         figures.save(figures.gallery(inputs, frames=frames), out / "figures" / "gallery.png")
 

@@ -254,7 +254,13 @@ def window_origin(
     Raises:
       ShapeError: tcp not [4, 4].
     """
-    tcp = as_single(tcp, "tcp", (4, 4))
+    return _window_origin(view_camera, as_single(tcp, "tcp", (4, 4)), spec, jitter)
+
+
+@jax.jit
+def _window_origin(
+    view_camera: cam.Camera, tcp: jax.Array, spec: AlignSpec, jitter: Vector | None
+) -> tuple[jax.Array, jax.Array]:
     uv, valid = _seen(view_camera, tcp)
     if spec.crop is None:
         return jnp.zeros(2, jnp.int32), valid
@@ -306,12 +312,26 @@ def align_window(
         )
     tcp = as_single(tcp, "tcp", (4, 4))
     opening = as_single(opening, "opening", ())
+    origin = jnp.asarray(origin, jnp.int32)
+    return _align_window(image, view_camera, origin, tcp, opening, spec, jitter)
+
+
+@jax.jit
+def _align_window(
+    image: jax.Array,
+    view_camera: cam.Camera,
+    origin: jax.Array,
+    tcp: jax.Array,
+    opening: jax.Array,
+    spec: AlignSpec,
+    jitter: Vector | None,
+) -> Aligned:
     _, valid = _seen(view_camera, tcp)
     if spec.overlay:
         points = drawing.overlay_points(view_camera, tcp, spec.axis_length)
         points = _jittered(points, None if jitter is None else spec.scale * jnp.asarray(jitter))
         strokes = spec.strokes.scaled(spec.scale)
-        rows, columns = jnp.asarray(origin, jnp.int32)[:, None] + jnp.arange(spec.size)
+        rows, columns = origin[:, None] + jnp.arange(spec.size, dtype=jnp.int32)
         covered = drawing.coverage(points, strokes, rows, columns, sharp=False)
         image = drawing.paint(image, covered)
     return Aligned(image, _proprio(tcp, opening, view_camera, spec.layout), valid)

@@ -212,9 +212,10 @@ def _find(options: Options, inputs: Inputs) -> Seen:
 def _by_platform(
     options: Options, tiled: Callable[[Inputs], Any], fused: Callable[[Inputs], Any], inputs: Inputs
 ) -> Any:
-    if options.backend == "auto":
+    # Without an accelerator the other form is not even traced: half the time to trace.
+    if options.backend == "auto" and jax.default_backend() != "cpu":
         return lax.platform_dependent(inputs, cpu=tiled, default=fused)
-    return (tiled if options.backend == "tiled" else fused)(inputs)
+    return (fused if options.backend == "fused" else tiled)(inputs)
 
 
 def _resolve_all(options: Options, inputs: Inputs, tables: Tables, seen: Seen) -> Planes:

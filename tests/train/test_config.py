@@ -86,7 +86,10 @@ def test_folders_are_named_after_what_is_in_them() -> None:
         (["--stepps", "3"], r"unknown option --stepps \(did you mean --steps\?\); known: .*--task"),
         (["--steps", "0"], "steps: expected at least 1, got 0"),
         (["--scenes=-1"], "scenes: expected at least 1, got -1"),
-        (["--random-crop", "85"], "random_crop: expected at most image_size = 84, got 85"),
+        (
+            ["--image-size", "50", "--random-crop", "51"],
+            "random_crop: expected at most image_size = 50, got 51",
+        ),
         (["--backgrounds", "no/such/folder"], "backgrounds: no/such/folder is not a folder"),
     ],
 )
