@@ -39,19 +39,33 @@ def _batch(env: Env, worlds: int, repeats: int) -> dict[str, Any]:
 
 def _rollout(env: Env, data: Any, repeats: int, items: int) -> dict[str, float]:
     """The same steps of the same states by C MuJoCo, one thread a core."""
-    model, spec = env.mj_model, mujoco.mjtState.mjSTATE_FULLPHYSICS
-    c, states = mujoco.MjData(model), []
-    for qpos in np.asarray(data.qpos):
-        c.qpos[:] = qpos
+    model, c = env.mj_model, mujoco.MjData(env.mj_model)
+    physics_state = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
+    inputs = (
+        mujoco.mjtState.mjSTATE_CTRL.value
+        | mujoco.mjtState.mjSTATE_MOCAP_POS.value
+        | mujoco.mjtState.mjSTATE_MOCAP_QUAT.value
+    )
+
+    def read(spec: int) -> np.ndarray:
         state = np.zeros(mujoco.mj_stateSize(model, spec))
         mujoco.mj_getState(model, c, state, spec)
-        states.append(state)
-    control = np.repeat(np.asarray(data.ctrl, np.float64)[:, None], SUBSTEPS, axis=1)
+        return state
+
+    states, controls = [], []
+    for world in range(len(data.qpos)):
+        c.qpos[:], c.ctrl[:] = data.qpos[world], data.ctrl[world]
+        c.mocap_pos[:] = np.reshape(data.mocap_pos[world], (-1, 3))
+        c.mocap_quat[:] = np.reshape(data.mocap_quat[world], (-1, 4))
+        states.append(read(physics_state))
+        controls.append(np.tile(read(inputs), (SUBSTEPS, 1)))
     threads = os.cpu_count() or 1
+    pieces = [mujoco.MjData(model) for _ in range(threads)]
     with rollout.Rollout(nthread=threads) as pool:
-        pieces = [mujoco.MjData(model) for _ in range(threads)]
         figures = measure(
-            lambda: pool.rollout(model, pieces, np.stack(states), control),
+            lambda: pool.rollout(
+                model, pieces, np.stack(states), np.stack(controls), control_spec=inputs
+            ),
             repeats=repeats,
             items=items,
         )

@@ -92,9 +92,7 @@ def check_env(runner: Any, key: jax.Array, spec: Any, *, steps: int = 5) -> None
     same start; after the first step nothing is compiled.
     """
     worlds, env = runner.worlds, runner.env
-    params = jax.tree.map(
-        lambda x: jnp.broadcast_to(x, (worlds, *x.shape)), env.default_params()
-    )
+    params = jax.tree.map(lambda x: jnp.broadcast_to(x, (worlds, *x.shape)), env.default_params())
     scene_key, action_key = jax.random.split(key)
     scenes = jax.random.split(scene_key, worlds)
     state = start = runner.reset(scenes, params)

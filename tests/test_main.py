@@ -67,6 +67,8 @@ def test_bench_runs_from_a_checkout_wherever_the_caller_is(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "benchmarks").mkdir()
+    # A regular package, like the real one: a namespace package would lose against that.
+    (tmp_path / "benchmarks" / "__init__.py").touch()
     (tmp_path / "benchmarks" / "__main__.py").write_text("def main(argv):\n    print(argv)\n")
     monkeypatch.setattr(cli, "_checkout_root", lambda: tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))

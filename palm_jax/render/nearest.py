@@ -6,8 +6,8 @@ depth lost by that is found again by `intersect.surface`.
 
 Tiled form (CPU): bounding boxes tell which geoms can touch a tile, one bit each; a loop per family
 takes every tile through its own bits, as often as the longest list of the block needs. Fused form
-(accelerators): one broadcast and one minimum per family, which the compiler keeps in registers.
-Neither stores anything of size rays x geoms.
+(accelerators): every ray meets every geom, a few in each round, which the compiler keeps in
+registers between reading and writing the carry. Neither stores anything of size rays x geoms.
 """
 
 import functools
@@ -38,6 +38,7 @@ NOTHING = 0x7F7FFFFF
 """Bits of the largest float32: a key beyond every hit."""
 
 _WORD = 32  # geoms per bit mask
+_AT_ONCE = 4  # geoms in each round of the fused loops
 
 
 def slot_mask(types: Sequence[str]) -> int:
@@ -119,21 +120,30 @@ def _part(placed: Placed, slots: range) -> Placed:
 
 
 def _over_lists(
-    word: jax.Array, count: int, body: Callable[[jax.Array, jax.Array], jax.Array], start: jax.Array
+    lists: jax.Array,
+    groups: Sequence[Group],
+    body: Callable[[int, jax.Array, jax.Array], jax.Array],
+    start: jax.Array,
 ) -> jax.Array:
-    """Runs `body(index, carry)` over the set bits of each tile's word.
+    """Runs `body(group number, index, carry)` over the set bits of each tile's words.
 
-    `index` is int32 [N], and `count` for tiles whose bits are used up. There are as many rounds as
-    the fullest word has bits.
+    `index` int32 [N] counts within the group, and is the group's size for tiles whose bits are used
+    up. A group has as many rounds as its fullest word has bits.
     """
+    longest = jnp.max(lax.population_count(lists), 0).astype(jnp.int32)
+    carry = start
+    for number, group in enumerate(groups):
 
-    def step(_: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        carry, left = state
-        lowest = lax.population_count(~left & (left - 1)).astype(jnp.int32)
-        return body(jnp.minimum(lowest, count), carry), left & (left - 1)
+        def step(
+            number: int, count: int, _: jax.Array, state: tuple[jax.Array, jax.Array]
+        ) -> tuple[jax.Array, jax.Array]:
+            carry, left = state
+            lowest = lax.population_count(~left & (left - 1)).astype(jnp.int32)
+            return body(number, jnp.minimum(lowest, count), carry), left & (left - 1)
 
-    longest = jnp.max(lax.population_count(word)).astype(jnp.int32)
-    return lax.fori_loop(0, longest, step, (start, word))[0]
+        one = functools.partial(step, number, len(group.slots))
+        carry, _ = lax.fori_loop(0, longest[number], one, (carry, lists[:, number]))
+    return carry
 
 
 def _numbers(rows: jax.Array) -> list[jax.Array]:
@@ -196,7 +206,7 @@ def seen_tiled(
 
 
 def seen_fused(options: Options, scene: Scene, tables: Tables) -> Seen:
-    """What all pixels of all worlds see: one broadcast over a family's geoms and one reduction."""
+    """What all pixels of all worlds see, by trying every geom; a fixed number of operations."""
     key = _nearest_fused(options, scene.types, tables)
     if not options.shadowed:
         return Seen(key, None)
@@ -216,34 +226,64 @@ def _nearest_tiled(
     world: jax.Array,
     lists: jax.Array,
 ) -> jax.Array:
-    best = jnp.full((lists.shape[0], TILE * TILE), NOTHING, jnp.int32)
-    for i, group in enumerate(groups(types)):
+    parts = groups(types)
 
-        def closer(group: Group, rows: jax.Array, index: jax.Array, best: jax.Array) -> jax.Array:
-            u, v = pixel_coordinates(tiles, options.stride)
-            numbers = _numbers(rows[world * (len(group.slots) + 1) + index])
-            depth, counts = TESTS[group.family].hit(numbers, u, v)
-            slot = index[:, None] + group.slots.start
-            return jnp.minimum(best, _packed(depth, counts, slot, slot_mask(types)))
+    def closer(number: int, index: jax.Array, best: jax.Array) -> jax.Array:
+        group, rows = parts[number], search.hit_rows[number]
+        u, v = pixel_coordinates(tiles, options.stride)
+        numbers = _numbers(rows[world * (len(group.slots) + 1) + index])
+        depth, counts = TESTS[group.family].hit(numbers, u, v)
+        slot = index[:, None] + group.slots.start
+        return jnp.minimum(best, _packed(depth, counts, slot, slot_mask(types)))
 
-        body = functools.partial(closer, group, search.hit_rows[i])
-        best = _over_lists(lists[:, i], len(group.slots), body, best)
-    return best
+    nothing = jnp.full((lists.shape[0], TILE * TILE), NOTHING, jnp.int32)
+    return _over_lists(lists, parts, closer, nothing)
+
+
+def _over_all(
+    columns: jax.Array,
+    ok: jax.Array,
+    body: Callable[[Sequence[jax.Array], jax.Array, jax.Array], jax.Array],
+    start: jax.Array,
+) -> jax.Array:
+    """Runs `body(numbers, index, carry)` over all g geoms of a family, `_AT_ONCE` in each round.
+
+    Args:
+      columns: [W, g, F]; `numbers` are F arrays [W, 1]. ok: bool [W, g], which geoms are drawn.
+      body: sees numbers of a geom that nothing hits in place of one that is not drawn.
+      start: carry.
+    """
+    rounds = -(-columns.shape[1] // _AT_ONCE)
+    missing = rounds * _AT_ONCE - columns.shape[1]
+    rows = jnp.where(ok[..., None], columns, jnp.nan)
+    rows = jnp.pad(rows, ((0, 0), (0, missing), (0, 0)), constant_values=jnp.nan)
+
+    def step(k: jax.Array, carry: jax.Array) -> jax.Array:
+        part = lax.dynamic_slice_in_dim(rows, k * _AT_ONCE, _AT_ONCE, axis=1)
+        for j in range(_AT_ONCE):
+            carry = body(_numbers(part[:, j]), k * _AT_ONCE + j, carry)
+        return carry
+
+    return lax.fori_loop(0, rounds, step, start)
 
 
 def _nearest_fused(options: Options, types: Sequence[str], tables: Tables) -> jax.Array:
     u, v = pixel_coordinates(tables.tiles, options.stride)
     worlds = tables.left.shape[0]
-    u_row, v_row = (x.reshape(worlds, 1, -1) for x in (u, v))
-    best = jnp.full((worlds, u_row.shape[-1]), NOTHING, jnp.int32)
+    u_row, v_row = u.reshape(worlds, -1), v.reshape(worlds, -1)
+    best = jnp.full(u_row.shape, NOTHING, jnp.int32)
     for name, slots in slot_ranges(types).items():
+
+        def closer(
+            group: Group, numbers: Sequence[jax.Array], index: jax.Array, best: jax.Array
+        ) -> jax.Array:
+            depth, counts = TESTS[group.family].hit(numbers, u_row, v_row)
+            slot = index + group.slots.start
+            return jnp.minimum(best, _packed(depth, counts, slot, slot_mask(types)))
+
         part = _part(tables.placed, slots)
-        columns = TESTS[name].columns(part)[..., None]
-        numbers = [columns[:, :, i] for i in range(columns.shape[2])]
-        depth, counts = TESTS[name].hit(numbers, u_row, v_row)
-        slot = jnp.asarray(slots, jnp.int32)[None, :, None]
-        key = _packed(depth, counts & part.ok[:, :, None], slot, slot_mask(types))
-        best = jnp.minimum(best, jnp.min(key, axis=1))
+        body = functools.partial(closer, Group(name, slots))
+        best = _over_all(TESTS[name].columns(part), part.ok, body, best)
     return best.reshape(u.shape)
 
 
@@ -298,30 +338,24 @@ def _shadows_tiled(
     world: jax.Array,
     key: jax.Array,
 ) -> jax.Array:
+    parts = groups(scene.types)
     depth, slot = _split_key(scene.types, key)
+
+    def shade(light: int, number: int, index: jax.Array, bits: jax.Array) -> jax.Array:
+        group, rows = parts[number], search.shadow_rows[light][number]
+        u, v = pixel_coordinates(tiles, options.stride)
+        numbers = _numbers(rows[world * (len(group.slots) + 1) + index])
+        directional = scene.lights.directional[light]
+        blocked = _blocked(group.family, directional, numbers, u, v, depth)
+        blocked &= slot != index[:, None] + group.slots.start
+        return bits | jnp.where(blocked, 1 << light, 0)
+
     bits = jnp.zeros_like(key)
-    for light, tables in search.shadow_rows.items():
+    for light in search.shadow_rows:
         directional = scene.lights.directional[light]
         flags = _between(options, search, tiles, world, key, slot, light, directional)
         lists = words(scene.types, flags)
-        for i, group in enumerate(groups(scene.types)):
-
-            def shade(
-                group: Group,
-                rows: jax.Array,
-                light: int,
-                directional: bool,
-                index: jax.Array,
-                bits: jax.Array,
-            ) -> jax.Array:
-                u, v = pixel_coordinates(tiles, options.stride)
-                numbers = _numbers(rows[world * (len(group.slots) + 1) + index])
-                blocked = _blocked(group.family, directional, numbers, u, v, depth)
-                blocked &= slot != index[:, None] + group.slots.start
-                return bits | jnp.where(blocked, 1 << light, 0)
-
-            body = functools.partial(shade, group, tables[i], light, directional)
-            bits = _over_lists(lists[:, i], len(group.slots), body, bits)
+        bits = _over_lists(lists, parts, functools.partial(shade, light), bits)
     return bits
 
 
@@ -338,9 +372,9 @@ def _between(
     """bool [N, G]: may the geom lie between some point that the tile shows and the light?
 
     The segment from the middle of the tile's points to the light, against the geom's bounding box
-    grown by the radius of the points. A geom that is all that the tile shows does not shade itself.
+    grown by that of the points. A geom that is all that the tile shows does not shade itself.
     """
-    middle, radius = _points(options, tiles, key)
+    middle, points = _points(options, tiles, key)
     towards = tiles.vector(f"light{light}")
     if not directional:
         towards = _minus(towards, middle)
@@ -351,7 +385,8 @@ def _between(
         axis = components(box[..., 3 + 3 * i : 6 + 3 * i])
         start, step = dot(axis, from_box), dot(axis, towards)
         inverse = 1 / jnp.where(jnp.abs(step) < 1e-9, 1e-9, step)
-        half = 1.001 * (box[..., 12 + i] + radius) + 1e-4
+        wide = dot((jnp.abs(axis[0]), jnp.abs(axis[1]), jnp.abs(axis[2])), points)
+        half = 1.001 * (box[..., 12 + i] + wide) + 1e-4
         low, high = (-half - start) * inverse, (half - start) * inverse
         near, far = larger(smaller(low, high), near), smaller(larger(low, high), far)
     hit = key < NOTHING
@@ -361,8 +396,8 @@ def _between(
     return (near <= far) & search.ok[world] & (last >= 0) & ~only
 
 
-def _points(options: Options, tiles: TileTable, key: jax.Array) -> tuple[Vector, jax.Array]:
-    """Middle and radius of a ball round the points that a tile shows, camera frame; [N, 1] each."""
+def _points(options: Options, tiles: TileTable, key: jax.Array) -> tuple[Vector, Vector]:
+    """Middle and half sizes of a box round the points that a tile shows, camera frame."""
     depth, hit = lax.bitcast_convert_type(key, jnp.float32), key < NOTHING
     near = jnp.min(jnp.where(hit, depth, jnp.inf), -1, keepdims=True)
     far = jnp.max(jnp.where(hit, depth, 0.0), -1, keepdims=True)
@@ -377,7 +412,7 @@ def _points(options: Options, tiles: TileTable, key: jax.Array) -> tuple[Vector,
         first, second = jnp.minimum(low * near, low * far), jnp.maximum(high * near, high * far)
         middle.append(0.5 * (first + second))
         half.append(0.5 * (second - first))
-    return (middle[0], middle[1], middle[2]), jnp.sqrt(dot(half, half))  # type: ignore[arg-type]
+    return (middle[0], middle[1], middle[2]), (half[0], half[1], half[2])
 
 
 def _minus(p: Vector, q: Vector) -> Vector:
@@ -385,21 +420,30 @@ def _minus(p: Vector, q: Vector) -> Vector:
 
 
 def _shadows_fused(options: Options, scene: Scene, tables: Tables, key: jax.Array) -> jax.Array:
-    depth, slot = _split_key(scene.types, key)
     worlds = tables.left.shape[0]
-    u, v = pixel_coordinates(tables.tiles, options.stride)
-    u, v, depth, slot = (x.reshape(worlds, 1, -1) for x in (u, v, depth, slot))
-    bits = jnp.zeros((worlds, u.shape[-1]), jnp.int32)
+    planes = (*_split_key(scene.types, key), *pixel_coordinates(tables.tiles, options.stride))
+    depth, seen, u, v = (x.reshape(worlds, -1) for x in planes)
+    bits = jnp.zeros(u.shape, jnp.int32)
     for light, casts in enumerate(scene.lights.casts_shadow):
         if not casts:
             continue
         directional = scene.lights.directional[light]
-        columns = _shadow_columns(tables.placed, tables, light, directional)[..., None]
+        columns = _shadow_columns(tables.placed, tables, light, directional)
         for name, slots in slot_ranges(scene.types).items():
-            part = columns[:, slots.start : slots.stop]
-            numbers = [part[:, :, i] for i in range(part.shape[2])]
-            blocked = _blocked(name, directional, numbers, u, v, depth)
-            ok = tables.placed.ok[:, slots.start : slots.stop, None]
-            blocked &= ok & (slot != np.asarray(slots, np.int32)[None, :, None])
-            bits |= jnp.where(jnp.any(blocked, axis=1), 1 << light, 0)
+
+            def shade(
+                group: Group,
+                light: int,
+                directional: bool,
+                numbers: Sequence[jax.Array],
+                index: jax.Array,
+                bits: jax.Array,
+            ) -> jax.Array:
+                blocked = _blocked(group.family, directional, numbers, u, v, depth)
+                blocked &= seen != index + group.slots.start
+                return bits | jnp.where(blocked, 1 << light, 0)
+
+            part = slice(slots.start, slots.stop)
+            body = functools.partial(shade, Group(name, slots), light, directional)
+            bits = _over_all(columns[:, part], tables.placed.ok[:, part], body, bits)
     return bits.reshape(key.shape)

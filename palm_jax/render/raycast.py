@@ -65,7 +65,7 @@ def render(
         sees nothing.
       window: pixels of the camera's image to draw; by default all.
       outputs: names out of `OUTPUTS`; the others are None in the result and cost nothing.
-      shadows: hard shadows of the lights with `casts_shadow`; two to three times the work.
+      shadows: hard shadows of the lights with `casts_shadow`; about three times the work.
       backend: "tiled" (CPU) or "fused" (accelerators); "auto" takes the one for the platform.
 
     Returns:
@@ -78,6 +78,7 @@ def render(
       OptionError: an unknown type, texture, output or backend.
       ShapeError: a field of the wrong shape.
       DtypeError: a window origin that is not integer.
+      CameraError, PoseError: concrete values of a `Camera` that cannot be one.
     """
     outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     check_names(outputs, OUTPUTS, "output")
@@ -87,6 +88,9 @@ def render(
     scene.check()
     check_shape("Camera.K", camera.K, (3, 3))
     check_shape("Camera.cam_to_world", camera.cam_to_world, (4, 4))
+    check_values = getattr(camera, "check", None)
+    if check_values is not None:
+        check_values()
     if window is None:
         window = Window(jnp.zeros(2, jnp.int32), camera.height, camera.width)
     window.check()

@@ -78,7 +78,9 @@ def test_floor_has_diffuse_specular_and_shadow():
         ambient=[0.2, 0.3, 0.4],
     )
     scene = still_life(lights=lights)
-    scene = dataclasses.replace(scene, specular=jnp.array([0, 0.8, 0]), shininess=jnp.full(3, 0.1))
+    scene = dataclasses.replace(
+        scene, specular=jnp.float32([0, 0.8, 0]), shininess=jnp.float32([0.1] * 3)
+    )
     frame = jax.tree.map(np.asarray, drawn()(scene, CAMERA))
     floor = frame.segmentation == 10
     points = floor_points(CAMERA, np.where(floor, frame.depth, 0.0))
@@ -235,18 +237,40 @@ def test_gradients_are_finite_and_batch():
     assert (size[:2, 2, 0] < 0).all() and (size[:, 2, 1:] == 0).all()
 
 
-def test_nothing_of_size_rays_by_geoms_is_stored():
+@pytest.mark.parametrize(
+    "backend, output, bytes_per_pixel", [("tiled", "rgb", 24), ("fused", "segmentation", 72)]
+)
+def test_nothing_of_size_rays_by_geoms_is_stored(backend, output, bytes_per_pixel):
     worlds, side = 32, 84
     model, data = random_model(5, per_type=7)
     scene = scene_of(model, data)
-    draw = jax.jit(jax.vmap(lambda pos: render(dataclasses.replace(scene, pos=pos), camera_84).rgb))
-    camera_84 = camera_at([2.1, 1.7, 1.6], [0, 0, 0.5], side, side)
-    compiled = draw.lower(jnp.stack([scene.pos] * worlds)).compile()
+    camera = camera_at([2.1, 1.7, 1.6], [0, 0, 0.5], side, side)
+
+    def draw(pos):
+        moved = dataclasses.replace(scene, pos=pos)
+        return render(moved, camera, outputs=(output,), backend=backend)
+
+    compiled = jax.jit(jax.vmap(draw)).lower(jnp.stack([scene.pos] * worlds)).compile()
     pixels = worlds * side * side
-    # One float32 per ray and geom would be 33 MB.
-    assert model.ngeom * pixels * 4 > 30e6
-    assert compiled.memory_analysis().temp_size_in_bytes < 24 * pixels
+    # A float32 for every ray and geom would be twice what the accelerators' form may use.
+    assert 4 * model.ngeom > 2 * bytes_per_pixel
+    assert compiled.memory_analysis().temp_size_in_bytes < bytes_per_pixel * pixels
     assert "rsqrt" not in compiled.as_text(), "an approximate instruction: not the same everywhere"
+
+
+def test_form_is_chosen_by_platform(monkeypatch):
+    # As on a machine with an accelerator, where the choice is left to the compiled program.
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    window = Window(jnp.array([12, 14]), 13, 11)
+
+    def ids(backend):
+        return render(
+            still_life(), CAMERA, window, outputs=("segmentation",), backend=backend
+        ).segmentation
+
+    auto = ids("auto")
+    assert len(np.unique(auto)) > 1
+    np.testing.assert_array_equal(auto, ids("tiled"))
 
 
 def test_bad_input_is_named():

@@ -169,9 +169,7 @@ def break_group(file: h5py.File) -> None:
         (break_group, "not a whole demonstration file"),
     ],
 )
-def test_damaged_files_are_refused(
-    recorded: Path, tmp_path: Path, harm: Any, message: str
-) -> None:
+def test_damaged_files_are_refused(recorded: Path, tmp_path: Path, harm: Any, message: str) -> None:
     path = Path(shutil.copy(recorded, tmp_path / "harmed.hdf5"))
     with h5py.File(path, "r+") as file:
         harm(file)
