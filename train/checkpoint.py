@@ -131,7 +131,7 @@ def save(
     Returns:
       the checkpoint's folder, directory/STEP.
     """
-    directory = Path(directory)
+    directory = Path(directory).absolute()  # Orbax refuses relative paths
     if step < 0:
         raise ValueError(f"step is {step}; expected 0 or more")
     named = _named_leaves(tree)
@@ -395,6 +395,7 @@ def _compare(path: Path, saved: Mapping[str, Any], wanted: Mapping[str, Any]) ->
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     """All leaves as host arrays, whatever devices they were saved from."""
+    path = path.absolute()
     metadata = ocp.metadata(path).metadata
     like = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), metadata)
     return {name: np.asarray(leaf) for name, leaf in _named_leaves(ocp.load(path, like)).items()}

@@ -350,3 +350,12 @@ def test_the_newest_stays_without_any_score(tmp_path: Path) -> None:
     for step in (1, 2, 3):
         checkpoint.save(tmp_path, step, {"x": np.ones(1)}, keep=3)
     assert [step for step, _ in checkpoint.steps(tmp_path)] == [3]
+
+
+def test_a_relative_folder_will_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    tree = {"a": np.arange(3, dtype=np.float32)}
+    checkpoint.save("runs/here", 5, tree)
+    found = checkpoint.latest_valid(Path("runs/here"))
+    assert found is not None and found[0] == 5
+    np.testing.assert_array_equal(checkpoint.load(found[1], tree)["a"], tree["a"])
