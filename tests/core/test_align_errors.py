@@ -369,7 +369,8 @@ def test_errors_are_the_builtin_ones_too():
 
 def test_good_input_passes():
     run_with()
-    pa.align(np.float64(IMAGE) / 255, CAMERA, TCP.tolist(), True, SPEC)
+    seen = pa.align(np.float64(IMAGE) / 255, CAMERA, TCP.tolist(), True, SPEC)
+    assert bool(seen.valid) and np.isfinite(seen.image).all() and np.isfinite(seen.proprio).all()
 
 
 def test_a_traced_fraction_is_refused():
