@@ -40,6 +40,8 @@ WIDE_FRAME = 1024
 
 _LOCATE_SIZE = 128  # the mask for the global policy: the wide frame at an eighth
 _SUBSTEPS = 10
+_MAX_DRAWS = 16  # start poses drawn before an episode is declared impossible
+_IN_REACH = 0.002  # metres and radians that a start pose may be off
 CONTROL_RATE = 20.0
 """Control steps a second."""
 
@@ -78,6 +80,8 @@ class State:
     object_yaw: jax.Array  # [] and its yaw
     located: jax.Array  # [2] xy that the global policy found
     seen: jax.Array  # bool []: the target was in the global policy's mask
+    draws: jax.Array  # int32 [] start poses drawn until one was in reach
+    reachable: jax.Array  # bool []: one of them was; otherwise the arm waits at its home pose
     step: jax.Array  # int32 [] control steps taken
     success: jax.Array  # bool []: solved at some step so far
     nan: jax.Array  # bool []: physics diverged; the world stays at its last finite state
@@ -181,6 +185,8 @@ class Env:
             object_yaw=yaw,
             located=xy,
             seen=jnp.ones((), bool),
+            draws=jnp.zeros((), jnp.int32),
+            reachable=jnp.ones((), bool),
             step=jnp.zeros((), jnp.int32),
             success=jnp.zeros((), bool),
             nan=jnp.zeros((), bool),
@@ -227,24 +233,46 @@ class Env:
         return dataclasses.replace(state, located=xy, seen=count > 0)
 
     def reposition(self, key: jax.Array, state: State, params: EnvParams) -> State:
-        """The global policy, second half: the TCP goes to a random xy near the located target."""
-        xy_key, height_key, yaw_key = jax.random.split(key, 3)
-        offset = jax.random.uniform(xy_key, (2,), minval=-1.0, maxval=1.0) * params.start_radius
-        height = TABLE_HEIGHT + _uniform(height_key, params.start_height)
-        yaw = _uniform(yaw_key, params.start_yaw) + params.align_hand * state.camera_angle
-        target = control.pointing_down(jnp.append(state.located + offset, height), yaw)
-        arm = control.reach(self.chain, jnp.asarray(self.chain.home), target)
+        """The global policy, second half: the TCP goes to a random xy near the located target.
+
+        A pose out of the arm's reach is drawn again, up to a bound; `State.draws` counts.
+        """
+
+        def draw(carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+            count = carry[0]
+            target = self._start_pose(jax.random.fold_in(key, count), state, params)
+            arm = control.reach(self.chain, home, target)
+            tcp = control.forward_kinematics(self.chain, arm).tcp
+            return count + 1, arm, jnp.all(jnp.abs(control.pose_error(tcp, target)) < _IN_REACH)
+
+        home = jnp.asarray(self.chain.home)
+        draws, arm, reachable = jax.lax.while_loop(
+            lambda carry: ~carry[2] & (carry[0] < _MAX_DRAWS),
+            draw,
+            (jnp.zeros((), jnp.int32), home, jnp.zeros((), bool)),
+        )
+        arm = jnp.where(reachable, arm, home)
         data = state.data.replace(
             qpos=state.data.qpos.at[self._arm_qpos].set(arm),
             ctrl=self._servo_targets(arm, jnp.ones(())),
         )
-        return dataclasses.replace(state, data=mjx.kinematics(self.mjx_model, data))
+        data = mjx.kinematics(self.mjx_model, data)
+        return dataclasses.replace(state, data=data, draws=draws, reachable=reachable)
+
+    def _start_pose(self, key: jax.Array, state: State, params: EnvParams) -> jax.Array:
+        """TCP pose [4, 4] near the located target, pointing down."""
+        xy_key, height_key, yaw_key = jax.random.split(key, 3)
+        offset = jax.random.uniform(xy_key, (2,), minval=-1.0, maxval=1.0) * params.start_radius
+        height = TABLE_HEIGHT + _uniform(height_key, params.start_height)
+        yaw = _uniform(yaw_key, params.start_yaw) + params.align_hand * state.camera_angle
+        return control.pointing_down(jnp.append(state.located + offset, height), yaw)
 
     def step(self, state: State, action: jax.Array, params: EnvParams) -> State:
         """One control step (50 ms) of `action` [10]; see the class. Latches success and NaN."""
         del params  # physics does not shift (yet): the signature leaves room for it
         target = apply_delta(self.tcp(state), action[:9])
-        arm = control.solve_ik(self.chain, state.data.qpos[self._arm_qpos], target)
+        now = state.data.qpos[self._arm_qpos]
+        arm = now + self._slowed(control.solve_ik(self.chain, now, target) - now)
         gripper = (state.data.ctrl[-len(self._open) :] - self._closed) / (self._open - self._closed)
         goal = jnp.where(action[9] > 0.5, 1.0, 0.0)
         limit = self.robot.gripper_speed
@@ -336,6 +364,11 @@ class Env:
         qpos = jnp.asarray(self.mj_model.qpos0, jnp.float32)
         qpos = qpos.at[self._arm_qpos].set(self.chain.home)
         return qpos.at[self._gripper_qpos].set(self._open)
+
+    def _slowed(self, move: jax.Array) -> jax.Array:
+        """`move` [J] of the joints in one control step, scaled down to the robot's speed limits."""
+        allowed = jnp.asarray(self.robot.velocity_limits) / CONTROL_RATE
+        return move * jnp.minimum(1.0, jnp.min(allowed / jnp.maximum(jnp.abs(move), 1e-9)))
 
     def _servo_targets(self, arm: jax.Array, opening: jax.Array) -> jax.Array:
         fingers = self._closed + opening * (self._open - self._closed)

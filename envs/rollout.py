@@ -45,6 +45,26 @@ def _outcome(state: State, length: jax.Array) -> Episodes:
     )
 
 
+class StartPoseError(ValueError):
+    """`EnvParams` ask for start poses that the arm cannot take."""
+
+
+def _check_reachable(state: State, params: EnvParams) -> None:
+    """Raises StartPoseError for the first world whose start poses were all out of reach."""
+    lost = np.flatnonzero(~np.asarray(state.reachable))
+    if len(lost):
+        world = lost[0]
+        x, y = np.asarray(state.located[world])
+        low, high = np.asarray(params.start_height[world])
+        raise StartPoseError(
+            f"{len(lost)} of {len(state.reachable)} worlds have no start pose in the arm's reach "
+            f"after {int(state.draws[world])} draws; the first: a target located at "
+            f"x {x:.2f}, y {y:.2f} m with start_radius {float(params.start_radius[world]):.2f} m "
+            f"and start_height {low:.2f} to {high:.2f} m. "
+            "Move object_low and object_high closer to the robot, or lower start_radius."
+        )
+
+
 class Runner:
     """The compiled pieces of an environment for a fixed number of worlds.
 
@@ -69,10 +89,16 @@ class Runner:
         self._observers: dict[tuple[AlignSpec, int], Callable[..., Aligned]] = {}
 
     def reset(self, keys: jax.Array, params: EnvParams) -> State:
-        """`Env.reset` of W worlds, in three compiled pieces."""
+        """`Env.reset` of W worlds, in three compiled pieces.
+
+        Raises:
+          StartPoseError: no start pose within the arm's reach was found for some world.
+        """
         keys = jax.vmap(jax.random.split)(keys)
         state = self._place(keys[:, 0], params)
-        return self._reposition(keys[:, 1], self._locate(state, params), params)
+        state = self._reposition(keys[:, 1], self._locate(state, params), params)
+        _check_reachable(state, params)
+        return state
 
     def observe(
         self, state: State, params: EnvParams, spec: AlignSpec, *, frame: int = WIDE_FRAME

@@ -14,11 +14,19 @@ from palm_jax.envs.robots import Robot
 
 
 class Contact(NamedTuple):
-    """Two geoms that may touch, with their sliding friction coefficient."""
+    """Two geoms that may touch.
+
+    Attributes:
+      first, second: names of the geoms.
+      friction: sliding friction coefficient.
+      stiff: for what a gripper pushes on: twice as stiff as MuJoCo's default, the most that the
+        time step allows.
+    """
 
     first: str
     second: str
     friction: float
+    stiff: bool = False
 
 
 def asset_path(*parts: str) -> pathlib.Path:
@@ -42,6 +50,7 @@ def build_spec(robot: Robot, task_asset: str, contacts: tuple[Contact, ...]) -> 
 def _model_xml(files: tuple[str, ...], contacts: tuple[Contact, ...]) -> str:
     pairs = "".join(
         f'<pair geom1="{c.first}" geom2="{c.second}" condim="3" '
+        f'solref="{0.01 if c.stiff else 0.02} 1" '
         f'friction="{c.friction} {c.friction} 0.005 0.0001 0.0001"/>'
         for c in contacts
     )

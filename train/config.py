@@ -73,17 +73,17 @@ class Config:
     random_crop: int = 58
     width: int = 16
     norm: str = "group"
-    steps: int = 2400
+    steps: int = 2000
     batch_size: int = 32
     learning_rate: float = 1e-3
     schedule: str = "cosine"
     warmup_steps: int = 100
     weight_decay: float = 0.0
     ema: float = 0.99
-    overlay_warmup: int = 800
+    overlay_warmup: int = 700
     perspective: float = 0.1
     backgrounds: Path | None = None
-    checkpoint_every: int = 600
+    checkpoint_every: int = 500
     select_from: float = 0.7
     select_scenes: int = 24
     keep: int = 3
@@ -155,12 +155,12 @@ def cpu() -> Config:
         demos=200,
         image_size=84,
         random_crop=76,
-        steps=3000,
-        checkpoint_every=750,
-        select_from=0.45,
+        steps=5000,
+        checkpoint_every=1000,
+        select_from=0.5,
         select_scenes=50,
         scenes=50,
-        overlay_warmup=1000,
+        overlay_warmup=1500,
     )
 
 

@@ -15,6 +15,7 @@ class Robot:
       name: key in `ROBOTS`.
       asset: MJCF file name inside `assets/robots/`.
       arm_joints: names of the arm's hinge joints, from the base to the flange.
+      velocity_limits: of the arm's joints (rad/s), the maker's; large moves are slowed to them.
       gripper_joints: names of the finger joints.
       gripper_closed: finger joint positions of the closed gripper (metres or radians).
       gripper_open: finger joint positions of the open gripper.
@@ -29,6 +30,7 @@ class Robot:
     name: str
     asset: str
     arm_joints: tuple[str, ...]
+    velocity_limits: tuple[float, ...]
     gripper_joints: tuple[str, ...]
     gripper_closed: tuple[float, ...]
     gripper_open: tuple[float, ...]

@@ -70,10 +70,14 @@ class LiftTask(Task):
     aligned: bool
 
     def contacts(self, robot: Robot) -> tuple[Contact, ...]:
-        pads = [Contact(pad, self.grasp_geom, PAD_FRICTION) for pad in robot.pads]
+        pads = [Contact(pad, self.grasp_geom, PAD_FRICTION, stiff=True) for pad in robot.pads]
         rests = [Contact(*pair, OBJECT_FRICTION) for pair in self.supports]
         obstacles = ("table", *self.tip_obstacles)
-        tips = [Contact(tip, geom, OBJECT_FRICTION) for tip in robot.tips for geom in obstacles]
+        tips = [
+            Contact(tip, geom, OBJECT_FRICTION, stiff=True)
+            for tip in robot.tips
+            for geom in obstacles
+        ]
         return (*pads, *rests, *tips)
 
     def bind(self, model: mujoco.MjModel, robot: Robot) -> LiftIds:
@@ -145,4 +149,4 @@ class LiftTask(Task):
 
     def _holding_opening(self) -> float:
         # The Panda's 0.08 m at full opening; other grippers stall at the same width.
-        return self.grasp_width / 0.08 + 0.08
+        return self.grasp_width / 0.08 + 0.03

@@ -11,12 +11,12 @@ import worlds
 
 from palm_jax.envs import shifts
 from palm_jax.envs.base import State
-from palm_jax.envs.rollout import repeat_params
+from palm_jax.envs.rollout import StartPoseError, repeat_params
 from palm_jax.envs.tasks import TABLE_HEIGHT
 
-LOCATED = {"lift_spam": 0.016, "lift_lid": 0.03}
-"""Largest error (m) of the located xy. The mask shows the half of an object that faces the camera:
-the lid's centroid lies 2 cm towards it, in training as in test."""
+LOCATED = {"lift_spam": 0.016, "lift_lid": 0.010}
+"""Largest error (m) of the located xy: the mask shows the side of an object that faces the
+camera."""
 
 tasks = pytest.mark.parametrize("task", worlds.TASKS)
 
@@ -87,6 +87,30 @@ def test_the_hand_goes_where_it_is_told() -> None:
         np.testing.assert_allclose(yaw, 0.2 + align_hand * state.camera_angle, atol=0.005)
 
 
+def test_start_poses_out_of_reach_are_drawn_again() -> None:
+    """A target at the edge of the reach: some draws fail, all hands start where they should."""
+    runner = worlds.runner("lift_spam")
+    corner = shifts.at_object(runner.env.default_params(), jnp.array([0.45, 0.30]))
+    state = runner.reset(worlds.keys(3), repeat_params(corner, worlds.WORLDS))
+    assert state.reachable.all() and state.draws.min() == 1 and state.draws.max() > 1
+    tcp = worlds.tcp(runner.env, state)
+    assert np.abs(tcp[:, :2, 3] - state.located).max() < 0.062
+    assert (tcp[:, 2, 2] < -0.9999).all()
+
+
+def test_a_region_out_of_reach_is_an_error_that_names_the_params() -> None:
+    runner = worlds.runner("lift_spam")
+    # In view of the camera, a metre from the robot.
+    far = shifts.at_object(runner.env.default_params(), jnp.array([0.72, 0.0]))
+    some = jax.tree.map(
+        lambda near, away: jnp.stack([near] * (worlds.WORLDS - 2) + [away] * 2),
+        runner.env.default_params(),
+        far,
+    )
+    with pytest.raises(StartPoseError, match=r"2 of 16 .* 16 draws.*start_radius.*object_low"):
+        runner.reset(worlds.keys(3), some)
+
+
 def test_scenes_depend_on_their_own_key_alone() -> None:
     runner = worlds.runner("lift_spam")
     params = worlds.params(runner.env, "workspace")
@@ -125,25 +149,15 @@ def test_a_held_object_does_not_slip(task: str) -> None:
 
 @tasks
 def test_nothing_passes_through_anything(task: str) -> None:
-    """Supports carry their object within half a millimetre; pads press into it by at most 6 mm.
-
-    The pads' depth is that of a soft contact under the gripper's full force, largest for an instant
-    when they close on a can that is not yet square between them: in the lift, 90 % are below 3 mm.
-    """
+    """Supports carry their object within half a millimetre, fingers press into it by under 3 mm."""
     env = worlds.runner(task).env
     fingers = set(env.robot.pads) | set(env.robot.tips)
-    lifting = []
     for states in worlds.expert_episodes(task):
         solved = states.success[-1]  # where it failed, the object may have been knocked over
-        risen = states.data.xpos[:, :, env._ids.body, 2] - states.object_start[..., 2] > 0.01
         for pair, distance in worlds.gaps(env, states).items():
             distance = distance[:, solved]
-            if fingers & set(pair):
-                assert distance.min() > -0.006, pair
-                lifting.append(distance[risen[:, solved]])
-            else:
-                assert distance.min() > -0.0005, pair
-    assert np.mean(np.concatenate(lifting) > -0.003) > 0.9
+            allowed = 0.003 if fingers & set(pair) else 0.0005
+            assert distance.min() > -allowed, pair
 
 
 @tasks
