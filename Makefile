@@ -43,6 +43,7 @@ demo: $(VENV)/.base
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/mypy -p palm_jax
 
 test: lint

@@ -1,20 +1,16 @@
 """Speed of behaviour cloning: the training step of the CPU presets, and acting.
 
 One step = random perspective, random overlay, crop, forward, backward and Adam, from uint8 images
-in host memory: width 16, 84 px cropped to 76, batch 64. `python -m benchmarks.bench_train` prints
-JSON. Wall-clock rates mean something on an idle machine only; milliseconds of CPU time per sample
-are less sensitive to company.
+in host memory: width 16, 84 px cropped to 76, batch 64.
 """
 
-import json
-import resource
 import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
 
+from benchmarks.common import measure
 from palm_jax import align
 from palm_jax.train import learner
 
@@ -22,27 +18,6 @@ SIDE = 84
 PROPRIO_DIM = 8
 SAMPLES = 1024
 ACT_BATCHES = (1, 64, 256)
-
-
-def _cpu_seconds() -> float:
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    return usage.ru_utime + usage.ru_stime
-
-
-def _measure(call: Callable[[], Any], *, repeats: int, items: int) -> dict[str, float]:
-    """Time `call`, which must wait for its own result, after one call that is not counted."""
-    call()
-    seconds, cpu = [], _cpu_seconds()
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - start)
-    cpu = _cpu_seconds() - cpu
-    return {
-        "per_second": items / min(seconds),
-        "per_second_median": items / float(np.median(seconds)),
-        "cpu_ms_each": 1e3 * cpu / repeats / items,
-    }
 
 
 def _data() -> learner.Batch:
@@ -77,12 +52,12 @@ def run(*, steps: int = 20, repeats: int = 10) -> dict[str, Any]:
         )
         done += 1
 
-    training = _measure(step, repeats=steps, items=config.batch_size)
+    training = measure(step, repeats=steps, items=config.batch_size)
     policy = made.policy_state(state)
 
     def act(count: int) -> dict[str, float]:
         images, proprio = {"front": data.images["front"][:count]}, data.proprio[:count]
-        return _measure(
+        return measure(
             lambda: jax.block_until_ready(made.jitted_act(key, policy, images, proprio)),
             repeats=repeats,
             items=count,
@@ -100,7 +75,3 @@ def run(*, steps: int = 20, repeats: int = 10) -> dict[str, Any]:
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(state.params)),
         "device": jax.devices()[0].device_kind,
     }
-
-
-if __name__ == "__main__":
-    print(json.dumps(run(), indent=2))

@@ -238,7 +238,9 @@ class Env:
         A pose out of the arm's reach is drawn again, up to a bound; `State.draws` counts.
         """
 
-        def draw(carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        def draw(
+            carry: tuple[jax.Array, jax.Array, jax.Array],
+        ) -> tuple[jax.Array, jax.Array, jax.Array]:
             count = carry[0]
             target = self._start_pose(jax.random.fold_in(key, count), state, params)
             arm = control.reach(self.chain, home, target)

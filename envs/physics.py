@@ -5,9 +5,8 @@ Two facts of XLA's CPU backend shape this file (figures in docs/performance.md):
 * its default fusion emitters make MJX about a thousand times slower, so physics is compiled with
   `compiler_options()` of its own; the renderer and the networks want the default, so they live in
   other jits (`jit_physics` is for physics alone);
-* inside `lax.scan`, fusions recompute kinematics across MJX's stages unless an
-`optimization_barrier`
-  stands between them.
+* inside `lax.scan`, fusions recompute kinematics across MJX's stages unless an optimisation
+  barrier stands between them.
 """
 
 from collections.abc import Callable

@@ -73,17 +73,17 @@ class Config:
     random_crop: int = 58
     width: int = 16
     norm: str = "group"
-    steps: int = 2000
+    steps: int = 2400
     batch_size: int = 32
     learning_rate: float = 1e-3
     schedule: str = "cosine"
     warmup_steps: int = 100
     weight_decay: float = 0.0
     ema: float = 0.99
-    overlay_warmup: int = 700
-    perspective: float = 0.1
+    overlay_warmup: int = 800
+    perspective: float = 0.2
     backgrounds: Path | None = None
-    checkpoint_every: int = 500
+    checkpoint_every: int = 600
     select_from: float = 0.7
     select_scenes: int = 24
     keep: int = 3
@@ -189,7 +189,6 @@ def paper() -> Config:
         select_scenes=50,
         scenes=50,
         overlay_warmup=1_600,
-        perspective=0.2,
     )
 
 

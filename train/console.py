@@ -165,9 +165,7 @@ def _rate_text(rate: float, unit: str) -> str:
     return f"{rate:.0f} {unit}s/s" if rate >= 10 else f"{rate:.1f} {unit}s/s"
 
 
-def track(
-    console: Console, items: Sequence[T], label: str, *, unit: str = "step"
-) -> Iterator[T]:
+def track(console: Console, items: Sequence[T], label: str, *, unit: str = "step") -> Iterator[T]:
     """Iterate over `items` with a `ProgressBar`."""
     with ProgressBar(console, len(items), label, unit=unit) as bar:
         for item in items:

@@ -237,8 +237,14 @@ def _heatmap(axes: Axes, panel: Grid, regions: Regions) -> Any:
     rate = success_rate(panel.successes, panel.episodes)
     colours = matplotlib.colormaps["cividis"]
     image = axes.pcolormesh(
-        panel.y_edges, panel.x_edges, np.ma.masked_invalid(rate), cmap=colours, vmin=0, vmax=1,
-        edgecolors="white", linewidth=0.6,
+        panel.y_edges,
+        panel.x_edges,
+        np.ma.masked_invalid(rate),
+        cmap=colours,
+        vmin=0,
+        vmax=1,
+        edgecolors="white",
+        linewidth=0.6,
     )
     _outline(axes, regions.train_x, regions.train_y, edgecolor="white", linewidth=2.6)
     _outline(
@@ -261,8 +267,16 @@ def _heatmap(axes: Axes, panel: Grid, regions: Regions) -> Any:
             lines.append((counts, -6.0, 5.5))
         for text, offset, size in lines:
             axes.annotate(
-                text, (ys[j], xs[i]), xytext=(0, offset), textcoords="offset points", ha="center",
-                va="center", fontsize=size, color=colour, zorder=5, path_effects=halo,
+                text,
+                (ys[j], xs[i]),
+                xytext=(0, offset),
+                textcoords="offset points",
+                ha="center",
+                va="center",
+                fontsize=size,
+                color=colour,
+                zorder=5,
+                path_effects=halo,
             )
     return image
 
@@ -273,7 +287,12 @@ def _hatch(axes: Axes, panel: Grid, i: int, j: int) -> None:
     height = float(panel.x_edges[i + 1] - panel.x_edges[i])
     axes.add_patch(
         Rectangle(
-            corner, width, height, facecolor="#f1f3f5", hatch="////", edgecolor="#c3c8cf",
+            corner,
+            width,
+            height,
+            facecolor="#f1f3f5",
+            hatch="////",
+            edgecolor="#c3c8cf",
             linewidth=0,
         )
     )
@@ -302,8 +321,13 @@ def angle_curves(curves: Mapping[str, Curve], regions: Regions, *, title: str = 
     axes.axvspan(-limit, limit, color="#f4f6f8", zorder=0, linewidth=0)
     axes.axvline(math.degrees(regions.train_angle), color=MUTED, linewidth=1, dashes=(4, 2))
     axes.annotate(
-        "training view", (math.degrees(regions.train_angle), 1.0), xytext=(4, 2),
-        xycoords=("data", "axes fraction"), textcoords="offset points", color=MUTED, fontsize=7.5,
+        "training view",
+        (math.degrees(regions.train_angle), 1.0),
+        xytext=(4, 2),
+        xycoords=("data", "axes fraction"),
+        textcoords="offset points",
+        color=MUTED,
+        fontsize=7.5,
         va="bottom",
     )
     few = len(curves) <= 3
@@ -323,14 +347,27 @@ def angle_curves(curves: Mapping[str, Curve], regions: Regions, *, title: str = 
         # With many methods the bars of all but the two protagonists step back.
         front = few or method in ("palm", "bc")
         axes.errorbar(
-            angle[seen], rate[seen], yerr=_bars(rate[seen], lower[seen], upper[seen]), fmt="none",
-            ecolor=style.colour, elinewidth=1, capsize=2 if front else 0, alpha=1 if front else 0.3,
+            angle[seen],
+            rate[seen],
+            yerr=_bars(rate[seen], lower[seen], upper[seen]),
+            fmt="none",
+            ecolor=style.colour,
+            elinewidth=1,
+            capsize=2 if front else 0,
+            alpha=1 if front else 0.3,
             zorder=3 if front else 2,
         )
         axes.plot(
-            angle[seen], rate[seen], color=style.colour, marker=style.marker, markersize=4.5,
-            linestyle=style.dash, linewidth=1.9 if front else 1.2, zorder=4 if front else 3,
-            clip_on=False, label=paper.method_label(method),
+            angle[seen],
+            rate[seen],
+            color=style.colour,
+            marker=style.marker,
+            markersize=4.5,
+            linestyle=style.dash,
+            linewidth=1.9 if front else 1.2,
+            zorder=4 if front else 3,
+            clip_on=False,
+            label=paper.method_label(method),
         )
     axes.set_xlim(-reach, reach)
     ticks = np.arange(-math.floor(reach / 10) * 10, reach, 10)
@@ -429,8 +466,15 @@ def _scatter(axes: Axes, records: list[DomainRecord], regions: Regions) -> None:
             xy[~solved, 1], xy[~solved, 0], s=20, marker="x", color=BAD, linewidth=1.1, zorder=3
         )
         axes.scatter(
-            xy[solved, 1], xy[solved, 0], s=20, marker="o", color=GOOD, alpha=0.85, linewidth=0.4,
-            edgecolors="white", zorder=3,
+            xy[solved, 1],
+            xy[solved, 0],
+            s=20,
+            marker="o",
+            color=GOOD,
+            alpha=0.85,
+            linewidth=0.4,
+            edgecolors="white",
+            zorder=3,
         )
     _outline(axes, regions.test_x, regions.test_y, edgecolor=TEST_REGION, linewidth=1.5)
     _outline(
@@ -442,10 +486,15 @@ def _scatter(axes: Axes, records: list[DomainRecord], regions: Regions) -> None:
     every, good = positions(records)
     inside = regions.in_training(every[:, 0], every[:, 1])
     axes.text(
-        0.985, 0.975,
+        0.985,
+        0.975,
         f"inside {good[inside].sum()}/{inside.sum()}   "
         f"outside {good[~inside].sum()}/{(~inside).sum()}",
-        transform=axes.transAxes, ha="right", va="top", fontsize=7.5, color=MUTED,
+        transform=axes.transAxes,
+        ha="right",
+        va="top",
+        fontsize=7.5,
+        color=MUTED,
     )
 
 
@@ -455,14 +504,24 @@ def _angle_histogram(axes: Axes, records: list[DomainRecord], regions: Regions) 
     centres, width = (degrees[1:] + degrees[:-1]) / 2, np.diff(degrees) * 0.86
     axes.bar(centres, successes, width=width, color=GOOD)
     axes.bar(
-        centres, episodes - successes, width=width, bottom=successes, facecolor="#fbe3d6",
-        edgecolor=BAD, linewidth=0.7, hatch="//////",
+        centres,
+        episodes - successes,
+        width=width,
+        bottom=successes,
+        facecolor="#fbe3d6",
+        edgecolor=BAD,
+        linewidth=0.7,
+        hatch="//////",
     )
     for centre, good, total in zip(centres, successes, episodes, strict=True):
         if total:
             axes.annotate(
-                f"{100 * good / total:.0f} %", (centre, total), xytext=(0, 2),
-                textcoords="offset points", ha="center", fontsize=7.5,
+                f"{100 * good / total:.0f} %",
+                (centre, total),
+                xytext=(0, 2),
+                textcoords="offset points",
+                ha="center",
+                fontsize=7.5,
             )
     axes.axvline(math.degrees(regions.train_angle), color=INK, linewidth=1.4, dashes=(4, 2))
     for bound in (-regions.test_angle, regions.test_angle):
@@ -524,8 +583,14 @@ def domain_bars(
     if marked:
         handles.append(
             Line2D(
-                [], [], linestyle="", marker="D", markersize=5, markerfacecolor="white",
-                markeredgecolor=INK, label="paper (mean of its 4 tasks)",
+                [],
+                [],
+                linestyle="",
+                marker="D",
+                markersize=5,
+                markerfacecolor="white",
+                markeredgecolor=INK,
+                label="paper (mean of its 4 tasks)",
             )
         )
     figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 5))
@@ -552,7 +617,12 @@ def _method_bars(
     place = np.array(present) + (index - (count - 1) / 2) * width
     axes.bar(place, rate, width=0.9 * width, color=look(method).colour)
     axes.errorbar(
-        place, rate, yerr=_bars(rate, lower, upper), fmt="none", ecolor=INK, elinewidth=0.9,
+        place,
+        rate,
+        yerr=_bars(rate, lower, upper),
+        fmt="none",
+        ecolor=INK,
+        elinewidth=0.9,
         capsize=min(2.5, 12 * width),
     )
     theirs = [paper.implied_success(method, domains[i]) for i in present]
@@ -561,8 +631,15 @@ def _method_bars(
         return False
     x, y = zip(*points, strict=True)
     axes.plot(
-        x, y, linestyle="", marker="D", markersize=4.5, markerfacecolor="white",
-        markeredgecolor=INK, markeredgewidth=1, zorder=5,
+        x,
+        y,
+        linestyle="",
+        marker="D",
+        markersize=4.5,
+        markerfacecolor="white",
+        markeredgecolor=INK,
+        markeredgewidth=1,
+        zorder=5,
     )
     return True
 
@@ -660,7 +737,12 @@ def _trace(axes: Axes, method: str, steps: Array, values: Array, scale: str) -> 
         values = _running_median(values, max(5, len(values) // 40))
     marker = style.marker if len(values) <= 15 else None
     axes.plot(
-        steps, values, color=style.colour, linestyle=style.dash, marker=marker, markersize=4,
+        steps,
+        values,
+        color=style.colour,
+        linestyle=style.dash,
+        marker=marker,
+        markersize=4,
         label=paper.method_label(method),
     )
 

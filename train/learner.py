@@ -302,31 +302,95 @@ def _unflatten(flat: jax.Array, like: model.Params) -> model.Params:
 
 @dataclasses.dataclass(frozen=True)
 class Learner:
-    """Pure functions; made by `make_learner`."""
+    """Behaviour cloning as pure functions of a configuration; made by `make_learner`.
+
+    Attributes:
+      config: see `LearnerConfig`.
+      proprio_dim: numbers of proprioception, P.
+      views: names of the images, in the order in which the head concatenates them.
+    """
 
     config: LearnerConfig
     proprio_dim: int
     views: tuple[str, ...]
-    init: Callable[..., TrainState]
-    """(key, normalizer, *, trunk=None) -> TrainState; `trunk` is a `model.PretrainedTrunk`."""
-    step: Callable[..., tuple[TrainState, dict[str, jax.Array]]]
-    """(key, state, batch, bank=None) -> (state, metrics).
 
-    `key` is that of the run, the same at every step; `bank` are backgrounds [K, H, W, 3] for the
-    random overlay, None for none. Metrics, all scalars: `loss`, `grad_norm` (before clipping),
-    `param_norm`, `update_norm`, `learning_rate`, `skipped` (in all so far).
-    """
-    act: Callable[..., jax.Array]
-    """(key, policy_state, images, proprio) -> actions [B, 10].
+    # -- pure functions ----------------------------------------------------------------------------
 
-    images: view -> [B, H, W, 3] uint8; proprio [B, P]. The actions are in their own units: a
-    rotation of two orthonormal columns, metres, and a gripper of exactly 0 or 1.
-    """
-    predict: Callable[..., tuple[jax.Array, dict[str, jax.Array]]]
-    """(policy_state, images, proprio) -> (actions [B, 10] in normalised units, intermediates).
+    def init(
+        self, key: jax.Array, normalizer: Normalizer, *, trunk: model.PretrainedTrunk | None = None
+    ) -> TrainState:
+        """The state before the first step, optionally with a pretrained trunk in every encoder."""
+        params, batch_stats = self._network.init(key)
+        if trunk is not None:
+            params, batch_stats = model.with_trunk(params, batch_stats, trunk)
+        return TrainState(
+            step=jnp.zeros((), jnp.int32),
+            skipped=jnp.zeros((), jnp.int32),
+            params=params,
+            batch_stats=batch_stats,
+            opt_state=_optimizer(self.config).init(_flatten(params)),
+            ema_params=jax.tree.map(jnp.copy, params) if self.config.ema else {},
+            normalizer=normalizer,
+        )
 
-    The network as it acts, without proprioceptive noise.
-    """
+    def step(
+        self, key: jax.Array, state: TrainState, batch: Batch, bank: jax.Array | None = None
+    ) -> tuple[TrainState, dict[str, jax.Array]]:
+        """One update.
+
+        Args:
+          key: that of the run, the same at every step.
+          state: from `init` or the step before.
+          batch: see `Batch`.
+          bank: backgrounds [K, H, W, 3] for the random overlay, None for none.
+
+        Returns:
+          The new state, and scalar metrics: `loss`, `grad_norm` (before clipping), `param_norm`,
+          `update_norm`, `learning_rate`, `skipped` (updates left out so far).
+        """
+        check_batch(batch, self.proprio_dim, self.views, self.config.crop)
+        image_key, proprio_key = jax.random.split(jax.random.fold_in(key, state.step))
+        images = _random_views(image_key, batch.images, bank, state.step, self.config)
+        proprio = self._noisy_proprio(proprio_key, state.normalizer, jnp.asarray(batch.proprio))
+        target = state.normalizer.action.normalize(jnp.asarray(batch.actions))
+
+        def loss_of(params: model.Params) -> tuple[jax.Array, model.Params]:
+            prediction, _, stats = self._network.apply(
+                params, state.batch_stats, images, proprio, train=True
+            )
+            return mean_squared_error(prediction, target), stats
+
+        (loss, stats), grads = jax.value_and_grad(loss_of, has_aux=True)(state.params)
+        return self._updated(state, loss, stats, _flatten(grads))
+
+    def predict(
+        self, policy: PolicyState, images: Mapping[str, jax.Array], proprio: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """(actions [B, 10] in normalised units, intermediates): the network as it acts, but for
+        the noise on proprioception."""
+        return self._output(
+            policy, images, policy.normalizer.proprio.normalize(jnp.asarray(proprio))
+        )
+
+    def act(
+        self,
+        key: jax.Array,
+        policy: PolicyState,
+        images: Mapping[str, jax.Array],
+        proprio: jax.Array,
+    ) -> jax.Array:
+        """Actions [B, 10] in their own units: a rotation of two orthonormal columns, metres, and a
+        gripper of exactly 0 or 1.
+
+        Args:
+          key: of the noise on proprioception.
+          policy: from `policy_state`.
+          images: view -> [B, H, W, 3] uint8.
+          proprio: [B, P].
+        """
+        noisy = self._noisy_proprio(key, policy.normalizer, jnp.asarray(proprio))
+        prediction, _ = self._output(policy, images, noisy)
+        return to_action(policy.normalizer.action.denormalize(prediction))
 
     def policy_state(self, state: TrainState) -> PolicyState:
         """The averaged parameters if the configuration asks for an average, else the newest."""
@@ -341,6 +405,8 @@ class Learner:
             return self.init(jax.random.key(0), Normalizer(*ranges))
 
         return jax.eval_shape(start)
+
+    # -- compiled ----------------------------------------------------------------------------------
 
     @functools.cached_property
     def jitted_init(self) -> Callable[..., TrainState]:
@@ -362,6 +428,92 @@ class Learner:
         """`predict`, compiled once per batch size."""
         return jax.jit(self.predict, compiler_options=compiler_options())
 
+    # -- internals ---------------------------------------------------------------------------------
+
+    @functools.cached_property
+    def _network(self) -> model.Network:
+        config = self.config
+        return model.make_network(
+            views=self.views,
+            proprio_dim=self.proprio_dim,
+            action_dim=ACTION_DIM,
+            width=config.width,
+            norm=config.norm,
+            coord_conv=config.coord_conv,
+            embed=config.embed,
+            hidden=config.hidden,
+            dtype=jnp.dtype(config.dtype),
+        )
+
+    def _updated(
+        self, state: TrainState, loss: jax.Array, stats: model.Params, gradient: jax.Array
+    ) -> tuple[TrainState, dict[str, jax.Array]]:
+        """The state after a gradient (a flat vector), and the step's metrics."""
+        config, flat = self.config, _flatten(state.params)
+        grad_norm = jnp.linalg.norm(gradient)
+        updates, opt_state = _optimizer(config).update(gradient, state.opt_state, flat)
+        # One bad batch must not poison the parameters, nor Adam's moments: leave it out, count it.
+        finite = jnp.isfinite(loss) & jnp.isfinite(grad_norm)
+        updates = jnp.where(finite, updates * self._rates(state.params), 0.0)
+        opt_state, stats = jax.tree.map(
+            lambda new, old: jnp.where(finite, new, old),
+            (opt_state, stats),
+            (state.opt_state, state.batch_stats),
+        )
+        flat = flat + updates
+        ema_params = state.ema_params
+        if config.ema:
+            averaged = config.ema * _flatten(ema_params) + (1 - config.ema) * flat
+            ema_params = _unflatten(averaged, ema_params)
+        skipped = state.skipped + ~finite
+        rate = _schedule(config)(state.step - state.skipped)
+        metrics = {
+            "loss": loss,
+            "grad_norm": grad_norm,
+            "param_norm": jnp.linalg.norm(flat),
+            "update_norm": jnp.linalg.norm(updates),
+            "learning_rate": jnp.asarray(rate, jnp.float32),
+            "skipped": skipped,
+        }
+        state = TrainState(
+            step=state.step + 1,
+            skipped=skipped,
+            params=_unflatten(flat, state.params),
+            batch_stats=stats,
+            opt_state=opt_state,
+            ema_params=ema_params,
+            normalizer=state.normalizer,
+        )
+        return state, metrics
+
+    def _rates(self, params: model.Params) -> jax.Array | float:
+        """[n] factor on the learning rate of each number of the flat vector."""
+        scale = self.config.encoder_lr_scale
+        if scale == 1:
+            return 1.0
+        sizes = {name: sum(x.size for x in jax.tree.leaves(part)) for name, part in params.items()}
+        return jnp.where(jnp.arange(sum(sizes.values())) < sizes["encoders"], scale, 1.0)
+
+    def _noisy_proprio(
+        self, key: jax.Array, normalizer: Normalizer, proprio: jax.Array
+    ) -> jax.Array:
+        x = normalizer.proprio.normalize(proprio)
+        return x + self.config.proprio_noise * jax.random.normal(key, x.shape, x.dtype)
+
+    def _output(
+        self, policy: PolicyState, images: Mapping[str, jax.Array], proprio: jax.Array
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        ready = {}
+        for view in self.views:
+            x = jnp.asarray(images[view])
+            if self.config.crop is not None:
+                x = align.center_crop(x, self.config.crop)
+            ready[view] = normalize_image(x)
+        prediction, out, _ = self._network.apply(
+            policy.params, policy.batch_stats, ready, proprio, train=False
+        )
+        return prediction, out
+
 
 def compiler_options() -> dict[str, Any]:
     """For every `jax.jit` around a network; they apply to CPUs only."""
@@ -371,144 +523,17 @@ def compiler_options() -> dict[str, Any]:
 def make_learner(
     config: LearnerConfig, proprio_dim: int, views: Sequence[str] = ("front",)
 ) -> Learner:
-    """Build the pure functions of a configuration.
+    """A learner for data with `proprio_dim` numbers of proprioception and these `views`.
 
-    Args:
-      config: see `LearnerConfig`.
-      proprio_dim: numbers of proprioception, P.
-      views: names of the images, in the order in which the head concatenates them.
+    Raises:
+      ValueError: a negative `proprio_dim`, or a view named twice.
     """
     views = tuple(views)
     if proprio_dim < 0 or len(set(views)) != len(views):
         raise ValueError(
             f"expected proprio_dim >= 0 and different views, got {proprio_dim} and {views}"
         )
-    network = model.make_network(
-        views=views,
-        proprio_dim=proprio_dim,
-        action_dim=ACTION_DIM,
-        width=config.width,
-        norm=config.norm,
-        coord_conv=config.coord_conv,
-        embed=config.embed,
-        hidden=config.hidden,
-        dtype=jnp.dtype(config.dtype),
-    )
-    optimizer = _optimizer(config)
-    schedule = _schedule(config)
-
-    def rates(params: model.Params) -> jax.Array | float:
-        """[n] factor on the learning rate of each number of the flat vector."""
-        if config.encoder_lr_scale == 1:
-            return 1.0
-        sizes = {name: sum(x.size for x in jax.tree.leaves(part)) for name, part in params.items()}
-        in_encoder = jnp.arange(sum(sizes.values())) < sizes["encoders"]
-        return jnp.where(in_encoder, config.encoder_lr_scale, 1.0)
-
-    def init(
-        key: jax.Array, normalizer: Normalizer, *, trunk: model.PretrainedTrunk | None = None
-    ) -> TrainState:
-        params, batch_stats = network.init(key)
-        if trunk is not None:
-            params, batch_stats = model.with_trunk(params, batch_stats, trunk)
-        return TrainState(
-            step=jnp.zeros((), jnp.int32),
-            skipped=jnp.zeros((), jnp.int32),
-            params=params,
-            batch_stats=batch_stats,
-            opt_state=optimizer.init(_flatten(params)),
-            ema_params=jax.tree.map(jnp.copy, params) if config.ema else {},
-            normalizer=normalizer,
-        )
-
-    def noisy_proprio(key: jax.Array, normalizer: Normalizer, proprio: jax.Array) -> jax.Array:
-        x = normalizer.proprio.normalize(proprio)
-        return x + config.proprio_noise * jax.random.normal(key, x.shape, x.dtype)
-
-    def step(
-        key: jax.Array, state: TrainState, batch: Batch, bank: jax.Array | None = None
-    ) -> tuple[TrainState, dict[str, jax.Array]]:
-        check_batch(batch, proprio_dim, views, config.crop)
-        image_key, proprio_key = jax.random.split(jax.random.fold_in(key, state.step))
-        images = _random_views(image_key, batch.images, bank, state.step, config)
-        proprio = noisy_proprio(proprio_key, state.normalizer, jnp.asarray(batch.proprio))
-        target = state.normalizer.action.normalize(jnp.asarray(batch.actions))
-
-        def loss_of(params: model.Params) -> tuple[jax.Array, model.Params]:
-            prediction, _, stats = network.apply(
-                params, state.batch_stats, images, proprio, train=True
-            )
-            return mean_squared_error(prediction, target), stats
-
-        (loss, stats), grads = jax.value_and_grad(loss_of, has_aux=True)(state.params)
-        flat, gradient = _flatten(state.params), _flatten(grads)
-        grad_norm = jnp.linalg.norm(gradient)
-        updates, opt_state = optimizer.update(gradient, state.opt_state, flat)
-        # One bad batch must not poison the parameters, nor Adam's moments: leave it out, count it.
-        finite = jnp.isfinite(loss) & jnp.isfinite(grad_norm)
-        updates = jnp.where(finite, updates * rates(state.params), 0.0)
-        opt_state, stats = jax.tree.map(
-            lambda new, old: jnp.where(finite, new, old),
-            (opt_state, stats),
-            (state.opt_state, state.batch_stats),
-        )
-        flat = flat + updates
-        params = _unflatten(flat, state.params)
-        ema_params = state.ema_params
-        if config.ema:
-            averaged = config.ema * _flatten(ema_params) + (1 - config.ema) * flat
-            ema_params = _unflatten(averaged, ema_params)
-        skipped = state.skipped + ~finite
-        metrics = {
-            "loss": loss,
-            "grad_norm": grad_norm,
-            "param_norm": jnp.linalg.norm(flat),
-            "update_norm": jnp.linalg.norm(updates),
-            "learning_rate": jnp.asarray(schedule(state.step - state.skipped), jnp.float32),
-            "skipped": skipped,
-        }
-        state = TrainState(
-            step=state.step + 1,
-            skipped=skipped,
-            params=params,
-            batch_stats=stats,
-            opt_state=opt_state,
-            ema_params=ema_params,
-            normalizer=state.normalizer,
-        )
-        return state, metrics
-
-    def network_output(
-        policy: PolicyState, images: Mapping[str, jax.Array], proprio: jax.Array
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        ready = {}
-        for view in views:
-            x = jnp.asarray(images[view])
-            if config.crop is not None:
-                x = align.center_crop(x, config.crop)
-            ready[view] = normalize_image(x)
-        prediction, out, _ = network.apply(
-            policy.params, policy.batch_stats, ready, proprio, train=False
-        )
-        return prediction, out
-
-    def predict(
-        policy: PolicyState, images: Mapping[str, jax.Array], proprio: jax.Array
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        normal = policy.normalizer.proprio.normalize(jnp.asarray(proprio))
-        return network_output(policy, images, normal)
-
-    def act(
-        key: jax.Array,
-        policy: PolicyState,
-        images: Mapping[str, jax.Array],
-        proprio: jax.Array,
-    ) -> jax.Array:
-        noisy = noisy_proprio(key, policy.normalizer, jnp.asarray(proprio))
-        prediction, _ = network_output(policy, images, noisy)
-        return to_action(policy.normalizer.action.denormalize(prediction))
-
-    return Learner(config, proprio_dim, views, init, step, act, predict)
+    return Learner(config, proprio_dim, views)
 
 
 def to_action(prediction: jax.Array) -> jax.Array:

@@ -527,9 +527,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The verb `report`; returns 0, or 2 with a message if there is nothing to report on."""
     options = tyro.cli(Options, args=argv, prog="palm-jax report")
     try:
-        written = write_report(
-            options.path, out=options.out, max_megabytes=options.max_megabytes
-        )
+        written = write_report(options.path, out=options.out, max_megabytes=options.max_megabytes)
     except FileNotFoundError as error:
         print(f"palm-jax report: {error}", file=sys.stderr)
         return 2

@@ -86,8 +86,11 @@ def compose_frame(
         word for word in (paper.task_label(task), paper.domain_title(domain)) if word
     )
     draw.text(
-        (edge, second), _shortened(draw, words, canvas.width - 2 * edge), font=_font(13),
-        fill="#c9cdd3", anchor="lm",
+        (edge, second),
+        _shortened(draw, words, canvas.width - 2 * edge),
+        font=_font(13),
+        fill="#c9cdd3",
+        anchor="lm",
     )
     if success is not None:
         # The outcome also as a bar, to be seen from afar.
@@ -136,8 +139,15 @@ def episode_frames(
     total = len(full_frames)
     frames = [
         compose_frame(
-            policy_inputs[i], full_frames[i], method=method, domain=domain, task=task, step=i + 1,
-            steps=total, success=success if i == total - 1 else None, height=height,
+            policy_inputs[i],
+            full_frames[i],
+            method=method,
+            domain=domain,
+            task=task,
+            step=i + 1,
+            steps=total,
+            success=success if i == total - 1 else None,
+            height=height,
         )
         for i in range(total)
     ]
@@ -162,7 +172,8 @@ def side_by_side(
     rows = math.ceil(len(videos) / columns)
     for time in range(max(map(len, videos))):
         sheet = np.full(
-            (rows * height + (rows - 1) * gap, columns * width + (columns - 1) * gap, 3), 255,
+            (rows * height + (rows - 1) * gap, columns * width + (columns - 1) * gap, 3),
+            255,
             np.uint8,
         )
         for index, video in enumerate(videos):
@@ -197,8 +208,14 @@ def write_video(path: Path, frames: Iterable[ImageArray], *, fps: int = 20) -> P
         return _write_gif(path.with_suffix(".gif"), frames, fps=fps)
     temporary = path.with_name("." + path.stem + ".tmp.mp4")
     writer = imageio.get_writer(
-        temporary, format="FFMPEG", fps=fps, codec="libx264", pixelformat="yuv420p",  # type: ignore[arg-type]
-        macro_block_size=2, quality=None, ffmpeg_log_level="error",
+        temporary,
+        format="FFMPEG",
+        fps=fps,
+        codec="libx264",
+        pixelformat="yuv420p",  # type: ignore[arg-type]
+        macro_block_size=2,
+        quality=None,
+        ffmpeg_log_level="error",
         output_params=["-crf", "23", "-preset", "medium", "-movflags", "+faststart"],
     )
     try:
@@ -226,7 +243,11 @@ def _write_gif(path: Path, frames: Iterable[ImageArray], *, fps: int) -> Path:
     ]
     content = io.BytesIO()
     pictures[0].save(
-        content, format="GIF", save_all=True, append_images=pictures[1:], loop=0,
+        content,
+        format="GIF",
+        save_all=True,
+        append_images=pictures[1:],
+        loop=0,
         duration=round(2000 / fps),
     )
     return write_atomic(path, content.getvalue())

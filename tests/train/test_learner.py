@@ -69,15 +69,15 @@ BANK = np.random.default_rng(9).integers(0, 256, (5, SIDE, SIDE, 3), dtype=np.ui
 TRACES: list[str] = []  # grows whenever the step of `full` is traced
 
 
+class TracedLearner(learner.Learner):
+    def step(self, *arguments: Any) -> Any:
+        TRACES.append("step")
+        return super().step(*arguments)
+
+
 @pytest.fixture(scope="module")
 def full() -> learner.Learner:
-    made = learner.make_learner(FULL, P)
-
-    def step(*arguments: Any) -> Any:
-        TRACES.append("step")
-        return made.step(*arguments)
-
-    return dataclasses.replace(made, step=step)
+    return TracedLearner(FULL, P, ("front",))
 
 
 @pytest.fixture(scope="module")
