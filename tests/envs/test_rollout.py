@@ -134,6 +134,7 @@ def test_environments_keep_the_contract(task: str) -> None:
 class ToyState:
     x: jax.Array  # [3]
     step: jax.Array  # int32 []
+    reachable: jax.Array  # bool []
 
 
 class Toy:
@@ -149,7 +150,7 @@ class Toy:
 
     def place(self, key: jax.Array, params: jax.Array) -> ToyState:
         x = jax.random.normal(key, (3,))
-        return ToyState(x, jnp.zeros((), jnp.int32))
+        return ToyState(x, jnp.zeros((), jnp.int32), jnp.ones((), bool))
 
     def locate(self, state: ToyState, params: jax.Array) -> ToyState:
         return state
@@ -167,8 +168,8 @@ class Toy:
         if self.fault == "nan":
             x = jnp.where(state.step == 2, jnp.nan, x)
         if self.fault == "dtype":
-            return ToyState(x, (state.step + 1).astype(jnp.float32))
-        return ToyState(x, state.step + 1)
+            return ToyState(x, (state.step + 1).astype(jnp.float32), state.reachable)
+        return ToyState(x, state.step + 1, state.reachable)
 
     def observe(self, state: ToyState, params: Any, spec: AlignSpec, *, frame: int) -> Aligned:
         image = jnp.clip(128 + 40 * state.x, 0, 255) * (self.fault != "same worlds")
