@@ -161,6 +161,7 @@ def cpu() -> Config:
         select_scenes=50,
         scenes=50,
         overlay_warmup=1500,
+        perspective=0.1,
     )
 
 
@@ -189,6 +190,7 @@ def paper() -> Config:
         select_scenes=50,
         scenes=50,
         overlay_warmup=1_600,
+        perspective=0.2,
     )
 
 

@@ -149,4 +149,4 @@ class LiftTask(Task):
 
     def _holding_opening(self) -> float:
         # The Panda's 0.08 m at full opening; other grippers stall at the same width.
-        return self.grasp_width / 0.08 + 0.03
+        return self.grasp_width / 0.08 + 0.08
