@@ -218,11 +218,14 @@ def write_video(path: Path, frames: Iterable[ImageArray], *, fps: int = 20) -> P
         ffmpeg_log_level="error",
         output_params=["-crf", "23", "-preset", "medium", "-movflags", "+faststart"],
     )
-    try:
-        for frame in frames:
-            writer.append_data(frame)
-    finally:
-        writer.close()
+    with warnings.catch_warnings():
+        # The child of this fork runs ffmpeg at once: none of JAX's threads can be missed in it.
+        warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
+        try:
+            for frame in frames:
+                writer.append_data(frame)
+        finally:
+            writer.close()
     temporary.replace(path)
     return path
 
