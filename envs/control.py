@@ -15,6 +15,9 @@ import numpy as np
 
 from palm_jax.envs.robots import Robot
 
+STEP_GAIN = 0.5
+"""Share of the way to its target that a scripted hand covers in one control step."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Chain:
@@ -155,7 +158,7 @@ def step_towards(
     tcp: jax.Array,
     target: jax.Array,
     *,
-    gain: float = 0.5,
+    gain: float = STEP_GAIN,
     max_distance: float = 0.010,
     max_angle: float = 0.07,
 ) -> jax.Array:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
-from palm_jax.envs.control import pointing_down
+from palm_jax.envs.control import STEP_GAIN, pointing_down
 from palm_jax.envs.physics import in_contact
 from palm_jax.envs.robots import Robot
 from palm_jax.envs.tasks.base import Command, Placement, Task
@@ -18,12 +18,15 @@ PAD_FRICTION = 1.5
 OBJECT_FRICTION = 1.0
 # The gripper closes within this of the grasp. The funnel below makes the height tell when that is:
 # what a policy must see at a glance, it learns; a conjunction of millimetres it would wait for.
-_CLOSE_HEIGHT = 0.014
+_CLOSE_HEIGHT = 0.011
 _CLOSE_RADIUS = 0.013
 _CLOSE_ANGLE = 0.25
 # The funnel: how far the hand stays up for an error sideways or in yaw.
 _FUNNEL_RADIUS = 0.005
 _FUNNEL_ANGLE = 0.06
+# The lift begins slowly: fingers that have yet to close fully do not slide off.
+_LIFT_SPEED = 0.004  # metres of the first control step
+_LIFT_GAIN = 0.3  # metres a step, per metre risen
 _LIFT_MARGIN = 0.03  # the expert heads for a point this far beyond the height that counts as solved
 _FUNNEL_SLOPE = 2.0  # metres of extra height per metre of lateral error
 _FUNNEL_SLOPE_ANGLE = 0.08  # metres of extra height per radian of yaw error
@@ -132,7 +135,11 @@ class LiftTask(Task):
         )
         closing = opening < 0.95
         holding = closing & (opening < self._holding_opening())
-        lifted = start[2] + (grasp[2] - data.xpos[ids.body, 2]) + self.lift_height + _LIFT_MARGIN
+        bottom = start[2] + (grasp[2] - data.xpos[ids.body, 2])
+        speed = _LIFT_SPEED + _LIFT_GAIN * jnp.maximum(tcp[2, 3] - bottom, 0.0)
+        lifted = jnp.minimum(
+            bottom + self.lift_height + _LIFT_MARGIN, tcp[2, 3] + speed / STEP_GAIN
+        )
         reach = jnp.concatenate([grasp[:2], (grasp[2] + above)[None]])
         up = jnp.concatenate([tcp[:2, 3], lifted[None]])
         stay = jnp.concatenate([tcp[:2, 3], grasp[2:]])
