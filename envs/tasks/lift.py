@@ -15,20 +15,21 @@ from palm_jax.envs.tasks.base import Command, Placement, Task
 from palm_jax.envs.world import Contact
 
 PAD_FRICTION = 1.5
-OBJECT_FRICTION = 1.0
+OBJECT_FRICTION = 0.3  # metal or plastic on wood: a finger that arrives first shifts the object
 # The gripper closes within this of the grasp. The funnel below makes the height tell when that is:
 # what a policy must see at a glance, it learns; a conjunction of millimetres it would wait for.
 _CLOSE_HEIGHT = 0.011
 _CLOSE_RADIUS = 0.013
 _CLOSE_ANGLE = 0.25
-# The funnel: how far the hand stays up for an error sideways or in yaw.
-_FUNNEL_RADIUS = 0.005
+# The funnel: how far the hand stays up for an error sideways or in yaw. Inside the radius the open
+# fingers pass the object: the hand goes all the way down and is put right there.
+_FUNNEL_RADIUS = 0.009
 _FUNNEL_ANGLE = 0.06
 # The lift begins slowly: fingers that have yet to close fully do not slide off.
 _LIFT_SPEED = 0.004  # metres of the first control step
 _LIFT_GAIN = 0.3  # metres a step, per metre risen
 _LIFT_MARGIN = 0.03  # the expert heads for a point this far beyond the height that counts as solved
-_FUNNEL_SLOPE = 2.0  # metres of extra height per metre of lateral error
+_FUNNEL_SLOPE = 3.0  # metres of extra height per metre of lateral error
 _FUNNEL_SLOPE_ANGLE = 0.08  # metres of extra height per radian of yaw error
 
 
