@@ -143,7 +143,7 @@ def _known(what: str, names: Iterable[str], known: Collection[str]) -> None:
 
 
 def quick() -> Config:
-    """`python -m palm_jax.train`: PALM beside BC on one task, about 12 minutes on two cores."""
+    """`python -m palm_jax.train`: PALM beside BC on one task, about ten minutes on two cores."""
     return Config()
 
 
