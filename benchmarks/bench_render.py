@@ -169,11 +169,3 @@ def run(
         if memory is not None:
             found[name]["temporary_mib"] = memory.temp_size_in_bytes / 2**20
     return {"frames_per_second": found["rgb"]["per_second"], **found}
-
-
-if __name__ == "__main__":
-    import json
-
-    result = run()
-    headline = {"frames_per_second": result["frames_per_second"]}
-    print(json.dumps({"palm_jax": headline, "details": result}, indent=2))

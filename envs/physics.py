@@ -2,7 +2,7 @@
 
 Two facts of XLA's CPU backend shape this file (figures in docs/performance.md):
 
-* its default fusion emitters make MJX about a thousand times slower, so physics is compiled with
+* its default fusion emitters make MJX hundreds of times slower, so physics is compiled with
   `compiler_options()` of its own; the renderer and the networks want the default, so they live in
   other jits (`jit_physics` is for physics alone);
 * inside `lax.scan`, fusions recompute kinematics across MJX's stages unless an optimisation
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from mujoco import mjx
 
 MAX_CPU_WORLDS = 128
-"""Larger batches fall off a cliff on XLA CPU: run them in chunks of at most this many worlds."""
+"""Larger batches are no faster on CPUs and take more memory: run them in chunks of at most this."""
 
 
 def compiler_options() -> dict[str, Any] | None:

@@ -69,6 +69,8 @@ def read_tensors(path: str | Path) -> tuple[dict[str, np.ndarray], str]:
         read = _read_legacy
     try:
         return read(data), digest
+    # Damaged bytes make pickle and zipfile raise all of these; the last is zipfile's word for a
+    # compression or an encryption that it does not know.
     except (
         ValueError, KeyError, IndexError, TypeError, AttributeError, EOFError,
         RecursionError, MemoryError, OverflowError, UnicodeDecodeError,

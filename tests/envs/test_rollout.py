@@ -83,7 +83,7 @@ def test_the_expert_as_a_policy_is_stopped_when_all_have_ended() -> None:
     assert not found.nan.any() and found.seen.all()
 
 
-def test_batches_beyond_the_cliff_are_refused() -> None:
+def test_batches_beyond_the_limit_are_refused() -> None:
     env = worlds.runner("lift_spam").env
     for count in (0, physics.MAX_CPU_WORLDS + 1):
         if jax.default_backend() == "cpu":
