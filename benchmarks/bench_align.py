@@ -28,6 +28,10 @@ def run(*, repeats: int = 20) -> dict[str, Any]:
         origin, _ = align.window_origin(view, tcp, spec)
         return align.align_window(image, view, origin, tcp, 1.0, spec)
 
+    def window_camera(tcp: jax.Array) -> align.Camera:
+        origin, _ = align.window_origin(view, tcp, spec)
+        return view.cropped(origin[::-1].astype(jnp.float32), SIDE, SIDE)
+
     def crop(image: jax.Array, tcp: jax.Array) -> jax.Array:
         uv, _ = align.project(camera, tcp[:3, 3])
         return align.tcp_crop(image, uv, 200, offset=(0, 40))
@@ -38,6 +42,10 @@ def run(*, repeats: int = 20) -> dict[str, Any]:
         "align": (jax.vmap(lambda i, t: align.align(i, camera, t, 1.0, spec)), (full, tcps)),
         "tcp_crop": (jax.vmap(crop), (full, tcps)),
         "random_perspective": (lambda i: align.random_perspective(key, i), (floats,)),
+        "random_turn": (
+            lambda i, c, t: align.random_turn(key, i, c, t[:, :3, 3], probability=1.0)[0],
+            (small, jax.vmap(window_camera)(tcps), tcps),
+        ),
         "random_overlay": (lambda i: align.random_overlay(key, i, bank), (floats,)),
         "random_crop": (lambda i: align.random_crop(key, i, 76), (floats,)),
     }

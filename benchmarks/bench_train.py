@@ -1,7 +1,7 @@
 """Speed of behaviour cloning: the training step of the CPU presets, and acting.
 
-One step = random perspective, random overlay, crop, forward, backward and Adam, from uint8 images
-in host memory: width 16, 84 px cropped to 76, batch 64.
+One step = random camera turn, random perspective, random overlay, crop, forward, backward and
+Adam, from uint8 images in host memory: width 16, 84 px cropped to 76, batch 64.
 """
 
 import time
@@ -22,16 +22,21 @@ ACT_BATCHES = (1, 64, 256)
 
 def _data() -> learner.Batch:
     rng = np.random.default_rng(0)
+    camera = align.Camera.from_fovy(17.0, SIDE, SIDE, np.eye(4))
     return learner.Batch(
         {"front": rng.integers(0, 256, (SAMPLES, SIDE, SIDE, 3), dtype=np.uint8)},
         rng.normal(size=(SAMPLES, PROPRIO_DIM)).astype(np.float32),
         rng.normal(size=(SAMPLES, learner.ACTION_DIM)).astype(np.float32),
+        cameras={
+            "front": jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], SAMPLES, 0), camera)
+        },
+        tcp=np.tile(np.array([0.0, 0.0, 1.2], np.float32), (SAMPLES, 1)),
     )
 
 
 def run(*, steps: int = 20, repeats: int = 10) -> dict[str, Any]:
     """Measure; `samples_per_second` is the best step's, `act` maps batch sizes to images/s."""
-    config = learner.LearnerConfig(overlay_warmup_steps=0)
+    config = learner.LearnerConfig(overlay_warmup_steps=0, turn=(0.35, 0.17))
     made = learner.make_learner(config, PROPRIO_DIM)
     data, key = _data(), jax.random.key(0)
     bank = jax.jit(align.procedural_bank, static_argnums=(1, 2))(key, 64, SIDE)

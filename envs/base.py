@@ -355,6 +355,14 @@ class Env:
         assert image is not None
         return align_window(image, view, origin, tcp, self.opening(state), spec)
 
+    def window_camera(
+        self, state: State, params: EnvParams, spec: AlignSpec, *, frame: int = WIDE_FRAME
+    ) -> Camera:
+        """The camera of the image that `observe` gives: size x size pixels, the TCP where it is."""
+        view = spec.view_camera(self.camera(state, params, frame=frame))
+        origin, _ = window_origin(view, self.tcp(state), spec)
+        return view.cropped(origin[::-1].astype(jnp.float32), spec.size, spec.size)
+
     def render(self, state: State, params: EnvParams, size: int, **options: Any) -> Frame:
         """The paper's full frame at `size` x `size` pixels; options as in `palm_jax.render`."""
         camera = self.camera(state, params, frame=PAPER_FRAME).scaled(size / PAPER_FRAME)

@@ -175,6 +175,30 @@ def perspective(image: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return out
 
 
+def turned_pose(pose: np.ndarray, pan: float, tilt: float) -> np.ndarray:
+    """A camera's pose after a turn about the world's z and one about its own x, its place kept."""
+    vertical = np.array([[np.cos(pan), -np.sin(pan), 0], [np.sin(pan), np.cos(pan), 0], [0, 0, 1]])
+    own = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    out = np.array(pose, float)
+    out[:3, :3] = vertical @ out[:3, :3] @ own
+    return out
+
+
+def turn_view(image: np.ndarray, camera, turned) -> np.ndarray:
+    """The ray of each pixel of the turned camera, looked up in the old image; as floats."""
+    height, width = image.shape[:2]
+    old, new = (np.asarray(c.K, float) for c in (camera, turned))
+    old_pose, new_pose = (np.asarray(c.cam_to_world, float) for c in (camera, turned))
+    out = np.zeros(image.shape)
+    for i in range(height):
+        for j in range(width):
+            ray = new_pose[:3, :3] @ np.linalg.solve(new, [j + 0.5, i + 0.5, 1])
+            x, y, z = old @ np.linalg.solve(old_pose[:3, :3], ray)
+            x, y = np.clip([x / z - 0.5, y / z - 0.5], 0, [width - 1, height - 1])
+            out[i, j] = bilinear(image, x, y)
+    return out
+
+
 def grid_crop(image: np.ndarray, start: np.ndarray, size: int) -> np.ndarray:
     """The reference's crop grid: `size` samples over size / n of the span of the pixel centres."""
     height, width = image.shape[:2]

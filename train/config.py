@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import math
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
@@ -46,6 +47,8 @@ class Config:
       ema: decay of the averaged parameters that act; 0 for none.
       overlay_warmup: updates before Random Overlay starts.
       perspective: distortion of the random perspective; the paper's is 0.2.
+      turn: largest pan and tilt (degrees) of the random camera turn, another perspective that the
+        rotation input follows; 0 0 for none, as in the paper.
       backgrounds: a folder of your own images for Random Overlay; procedural textures by default.
       checkpoint_every: updates between checkpoints; each is scored in-domain from `select_from` on.
       select_from: share of the training after which checkpoints are scored.
@@ -82,6 +85,7 @@ class Config:
     ema: float = 0.99
     overlay_warmup: int = 800
     perspective: float = 0.2
+    turn: tuple[float, float] = (20.0, 10.0)
     backgrounds: Path | None = None
     checkpoint_every: int = 600
     select_from: float = 0.7
@@ -110,6 +114,10 @@ class Config:
             overlay_warmup_steps=self.overlay_warmup,
             perspective_distortion=self.perspective,
             perspective_probability=0.5 if method.augment else 0.0,
+            turn=(math.radians(self.turn[0]), math.radians(self.turn[1]))
+            if method.augment
+            else (0.0, 0.0),
+            turn_proprio=method.layout.startswith("cam6d"),
         )
 
     def check(self) -> None:
@@ -130,6 +138,8 @@ class Config:
             )
         if self.backgrounds is not None and not self.backgrounds.is_dir():
             raise ConfigError(f"backgrounds: {self.backgrounds} is not a folder")
+        if not all(0 <= angle <= 80 for angle in self.turn):
+            raise ConfigError(f"turn: expected degrees from 0 to 80, got {self.turn}")
         for method in self.method:
             self.learner(methods.find(method))
 
@@ -191,6 +201,7 @@ def paper() -> Config:
         scenes=50,
         overlay_warmup=1_600,
         perspective=0.2,
+        turn=(0.0, 0.0),
     )
 
 

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from palm_jax.align import AlignSpec
+from palm_jax.align import AlignSpec, Camera
 from palm_jax.envs.base import PAPER_FRAME, Env, EnvParams
 from palm_jax.envs.expert import Demonstrator, Recording
 from palm_jax.envs.rollout import Runner, repeat_params, take_params
@@ -240,7 +240,7 @@ def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None
 
 def render_observations(
     runner: Runner, demos: Demos, spec: AlignSpec, *, frame: int
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, Camera]:
     """What a policy would have seen in every frame of the demonstrations.
 
     Args:
@@ -249,10 +249,14 @@ def render_observations(
       spec, frame: see `Env.observe`.
 
     Returns:
-      images [N, size, size, 3] uint8 and proprioception [N, P] float32.
+      images [N, size, size, 3] uint8, proprioception [N, P] float32, and the cameras of the images
+      (leaves [N, ...]).
     """
     total, worlds = len(demos.qpos), runner.worlds
-    images, proprio = [], []
+    images, proprio, cameras = [], [], []
+    camera_of = jax.jit(
+        jax.vmap(lambda state, params: runner.env.window_camera(state, params, spec, frame=frame))
+    )
     for first in range(0, total, worlds):
         rows = np.minimum(np.arange(first, first + worlds), total - 1)
         episode = demos.episode[rows]
@@ -267,7 +271,9 @@ def render_observations(
         seen = runner.observe(state, params, spec, frame=frame)
         images.append(np.asarray(seen.image))
         proprio.append(np.asarray(seen.proprio))
-    return np.concatenate(images)[:total], np.concatenate(proprio)[:total]
+        cameras.append(camera_of(state, params))
+    camera = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:total], *cameras)
+    return np.concatenate(images)[:total], np.concatenate(proprio)[:total], camera
 
 
 def summary(demos: Demos) -> dict[str, Any]:

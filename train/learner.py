@@ -6,10 +6,11 @@ printing stay with the caller, who hands in callbacks.
 
 Order of the operations on images, as in the authors' code (all inside the jitted step, which takes
 uint8): random perspective, random overlay of half of the batch, normalisation by ImageNet's mean
-and deviation, random crop, encoder. The crop's bilinear weights sum to one, so that cropping first
-and normalising the smaller image gives the same numbers, and is what is done. Proprioception gets
-Gaussian noise in normalised units, in training and in `act` alike. The loss is the mean square
-error over all ten action numbers, in normalised units.
+and deviation, random crop, encoder. Ours is one more at the front, off by default: a random turn of
+the camera, which the rotation input follows. The crop's bilinear weights sum to one, so that
+cropping first and normalising the smaller image gives the same numbers, and is what is done.
+Proprioception gets Gaussian noise in normalised units, in training and in `act` alike. The loss is
+the mean square error over all ten action numbers, in normalised units.
 
 Randomness: everything that a step draws comes from fold_in(key, state.step), and the order of the
 samples is a function of (key, step) alone (`batch_indices`). A run that was interrupted and resumed
@@ -83,6 +84,9 @@ class LearnerConfig:
     overlay_warmup_steps: int = 0  # no overlay before this step
     perspective_distortion: float = 0.2
     perspective_probability: float = 0.5  # per sample; 0 for no random perspective
+    turn: tuple[float, float] = (0.0, 0.0)  # largest pan and tilt of `align.random_turn`, radians
+    turn_probability: float = 0.5  # per sample
+    turn_proprio: bool = True  # proprioception begins with the 6D rotation seen by the camera
 
     def __post_init__(self) -> None:
         for name, known in (
@@ -103,10 +107,14 @@ class LearnerConfig:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected 0 or more")
         for name in (
             "overlay_fraction", "overlay_alpha", "perspective_distortion",
-            "perspective_probability",
+            "perspective_probability", "turn_probability",
         ):  # fmt: skip
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; expected 0 to 1")
+        if len(self.turn) != 2 or not all(0 <= angle <= 1.5 for angle in self.turn):
+            raise ValueError(
+                f"turn is {self.turn}; expected pan and tilt from 0 to 1.5 radians each"
+            )
         if not 0 <= self.ema < 1:
             raise ValueError(f"ema is {self.ema}; expected 0 (off) up to, not including, 1")
 
@@ -179,6 +187,9 @@ class Batch:
     images: dict[str, Any]  # view -> [B, H, W, 3] uint8
     proprio: Any  # [B, P] float32, in its own units
     actions: Any  # [B, 10] float32
+    cameras: dict[str, align.Camera] = dataclasses.field(default_factory=dict)
+    """view -> who took its images, leaves [B, ...]; only for `LearnerConfig.turn`."""
+    tcp: Any = None  # [B, 3] float32 metres in the world; only for `LearnerConfig.turn`
 
 
 @jax.tree_util.register_dataclass
@@ -227,6 +238,44 @@ def normalize_image(images: jax.Array) -> jax.Array:
     std = jnp.asarray(IMAGE_STD, jnp.float32)
     mean = jnp.asarray(IMAGE_MEAN, jnp.float32)
     return images.astype(jnp.float32) * (1 / (top * std)) - mean / std
+
+
+def _turned_views(
+    key: jax.Array, batch: Batch, view_of_proprio: str, config: LearnerConfig
+) -> Batch:
+    """The batch with `align.random_turn` applied to every view, and to the rotation input."""
+    images, proprio = dict(batch.images), batch.proprio
+    for index, (view, camera) in enumerate(sorted(batch.cameras.items())):
+        images[view], turned = align.random_turn(
+            jax.random.fold_in(key, index),
+            images[view],
+            camera,
+            batch.tcp,
+            pan=config.turn[0],
+            tilt=config.turn[1],
+            probability=config.turn_probability,
+        )
+        if config.turn_proprio and view == view_of_proprio:
+            proprio = _seen_by(jnp.asarray(proprio), camera, turned)
+    return dataclasses.replace(batch, images=images, proprio=proprio)
+
+
+def _check_cameras(batch: Batch, views: Sequence[str]) -> None:
+    if batch.tcp is None or set(batch.cameras) != set(views):
+        raise ValueError(
+            f"cameras, tcp: the configuration turns cameras, which needs those of {list(views)} "
+            f"and the TCP's positions, got cameras of {list(batch.cameras)} and tcp "
+            f"{None if batch.tcp is None else np.shape(batch.tcp)}; pass them, or set turn=(0, 0)"
+        )
+
+
+def _seen_by(proprio: jax.Array, camera: align.Camera, turned: align.Camera) -> jax.Array:
+    """Proprioception [B, P] whose rotation (its first six numbers) is that seen by `turned`."""
+    old, new = (jnp.asarray(c.cam_to_world)[:, :3, :3] for c in (camera, turned))
+    columns = proprio[:, ROTATION].reshape(-1, 2, 3)
+    # R_new^T R_old on each of the two columns.
+    seen = jnp.einsum("bwn,bwo,bco->bcn", new, old, columns, precision=lax.Precision.HIGHEST)
+    return proprio.at[:, ROTATION].set(seen.reshape(-1, 6))
 
 
 def _random_views(
@@ -350,6 +399,10 @@ class Learner:
         """
         check_batch(batch, self.proprio_dim, self.views, self.config.crop)
         image_key, proprio_key = jax.random.split(jax.random.fold_in(key, state.step))
+        if max(self.config.turn) > 0:
+            _check_cameras(batch, self.views)
+            turn_key = jax.random.fold_in(image_key, len(self.views))
+            batch = _turned_views(turn_key, batch, self.views[0], self.config)
         images = _random_views(image_key, batch.images, bank, state.step, self.config)
         proprio = self._noisy_proprio(proprio_key, state.normalizer, jnp.asarray(batch.proprio))
         target = state.normalizer.action.normalize(jnp.asarray(batch.actions))
@@ -676,6 +729,8 @@ def run(
             "the configuration has a random overlay, but no bank of backgrounds was given; "
             "pass one, e.g. align.procedural_bank(...), or set overlay_fraction=0"
         )
+    if max(config.turn) > 0:
+        _check_cameras(data, learner.views)
     keys = RunKeys.from_seed(seed)
     if state is None:
         normalizer = fit_normalizer(data.proprio, data.actions)

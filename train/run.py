@@ -31,7 +31,7 @@ from palm_jax.train import (
 )
 from palm_jax.train import console as terminal
 from palm_jax.train.config import Config, command, default_out
-from palm_jax.train.evaluate import Evaluator, evaluate, quoted
+from palm_jax.train.evaluate import VIEW, Evaluator, evaluate, quoted
 from palm_jax.train.metrics import MetricsLog, write_json
 
 _FILMED = "workspace+viewpoint"
@@ -166,8 +166,10 @@ def _one_method(
         return
     evaluator = workspace.make_evaluator(config, method, runner)
     spec = method.spec(runner.env.task, config.image_size)
-    images, proprio = demos.render_observations(runner, data, spec, frame=method.frame)
-    batch = learner.Batch({"front": images}, proprio, data.actions)
+    images, proprio, cameras = demos.render_observations(runner, data, spec, frame=method.frame)
+    batch = learner.Batch(
+        {VIEW: images}, proprio, data.actions, cameras={VIEW: cameras}, tcp=data.tcp[:, :3, 3]
+    )
     _train(config, evaluator, batch, folder, console)
     _evaluate(config, evaluator, folder, console)
 

@@ -41,7 +41,9 @@ from palm_jax.align.augment import (
     random_crop,
     random_overlay,
     random_perspective,
+    random_turn,
     subpixel_crop,
+    turn_view,
 )
 from palm_jax.align.camera import Camera, project, unproject, unproject_to_height
 from palm_jax.align.crop import resize, tcp_crop
@@ -77,11 +79,13 @@ __all__ = [
     "random_crop",
     "random_overlay",
     "random_perspective",
+    "random_turn",
     "resize",
     "rotation_6d",
     "subpixel_crop",
     "tcp_crop",
     "tcp_overlay",
+    "turn_view",
     "unproject",
     "unproject_to_height",
     "window_origin",

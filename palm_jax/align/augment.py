@@ -1,7 +1,8 @@
 """Random augmentation of image batches, for training only.
 
 Each random op draws and then calls a deterministic one, which is public too: `random_overlay` ->
-`overlay_blend`, `random_perspective` -> `perspective_warp`, `random_crop` -> `subpixel_crop`.
+`overlay_blend`, `random_perspective` -> `perspective_warp`, `random_turn` -> `turn_view`,
+`random_crop` -> `subpixel_crop`.
 Batches are [B, H, W, C], uint8 or float32 in [0, 1]; the dtype is kept and uint8 results are
 rounded to nearest. Keep images uint8 until the last op: it is several times faster. The reference's
 order is perspective, overlay, normalisation, crop.
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +21,17 @@ from jax import lax
 from jax.typing import ArrayLike
 
 from palm_jax._checks import (
+    CameraError,
     OptionError,
     ShapeError,
+    as_float,
     as_image,
     as_single,
     check_fits,
     check_range,
     is_concrete,
 )
+from palm_jax.align.camera import Camera, matmul
 
 
 def _to_dtype(image: jax.Array, dtype: jnp.dtype) -> jax.Array:
@@ -73,7 +78,7 @@ def _blend(image: jax.Array, background: jax.Array, alpha: jax.Array) -> jax.Arr
 
 
 def _if_any(
-    chosen: jax.Array, op: Callable[..., jax.Array], images: jax.Array, *args: jax.Array
+    chosen: jax.Array, op: Callable[..., jax.Array], images: jax.Array, *args: Any
 ) -> jax.Array:
     """op(images, *args) if any image is chosen, else the images.
 
@@ -296,6 +301,143 @@ def _random_perspective(
 def _crop_step(full: int, size: int) -> float:
     """Distance of two samples: the reference's grid spans size / full of the pixel centres."""
     return size / full * (full - 1) / (size - 1) if size > 1 else 0.0
+
+
+def turn_view(image: ArrayLike, camera: Camera, turned: Camera) -> jax.Array:
+    """The image that the camera would have taken, had it been turned about its own centre.
+
+    Exact but for the pixels: no depth is needed, because turning shows nothing new. Bilinear;
+    beyond the image its border pixels are repeated.
+
+    Args:
+      image: [H, W, 3] uint8 or float32.
+      camera: the camera that took it.
+      turned: where it looks instead, at the same place; its K may differ. See `Camera.turned`.
+
+    Returns:
+      [H, W, 3], dtype of the image. Pixels whose ray runs behind the old camera are those of the
+      border.
+
+    Raises:
+      ShapeError, DtypeError: not an RGB image of uint8 or float.
+      CameraError: concrete cameras at two places.
+      PoseError: see `Camera.check`.
+    """
+    image = as_image(image, "image", rgb=True)
+    camera.check()
+    turned.check()
+    if is_concrete((camera, turned)):
+        apart = np.linalg.norm(
+            np.asarray(camera.cam_to_world)[:3, 3] - np.asarray(turned.cam_to_world)[:3, 3]
+        )
+        if apart > 1e-4:
+            raise CameraError(
+                f"turned: expected a camera at the place of the first, got one {apart:.4f} m away; "
+                "a camera that moves sees other things, which no warp can show"
+            )
+    return _turn_view(image, camera, turned)
+
+
+def _turn_homography(camera: Camera, turned: Camera) -> jax.Array:
+    """[3, 3] from a pixel (u, v, 1) of the turned camera to one of the first, times a number."""
+    old, new = (jnp.asarray(c.cam_to_world, jnp.float32)[:3, :3] for c in (camera, turned))
+    # In closed form: batched 3x3 solvers are slow on CPUs.
+    fx, skew, cx = turned.K[0, 0], turned.K[0, 1], turned.K[0, 2]
+    fy, cy = turned.K[1, 1], turned.K[1, 2]
+    zero, one = jnp.zeros_like(fx), jnp.ones_like(fx)
+    back = jnp.stack(
+        [
+            jnp.stack([1 / fx, -skew / (fx * fy), (skew * cy - cx * fy) / (fx * fy)]),
+            jnp.stack([zero, 1 / fy, -cy / fy]),
+            jnp.stack([zero, zero, one]),
+        ]
+    )
+    return matmul(jnp.asarray(camera.K, jnp.float32), matmul(matmul(old.T, new), back))
+
+
+@jax.jit
+def _turn_view(
+    image: jax.Array, camera: Camera, turned: Camera, active: jax.Array | bool = True
+) -> jax.Array:
+    height, width, _ = image.shape
+    pull = _turn_homography(camera, turned)
+    x = np.arange(width, dtype=np.float32)[None, :]
+    y = np.arange(height, dtype=np.float32)[:, None]
+    u, v, w = (row[0] * (x + 0.5) + (row[1] * (y + 0.5) + row[2]) for row in pull)
+    w = jnp.maximum(w, 1e-6)
+    points = []
+    for source, at, size in ((u, x, width), (v, y, height)):
+        position = jnp.clip(source / w - 0.5, 0.0, size - 1.0)
+        points.append(jnp.where(active, position, at))
+    return _sample(image, *points)
+
+
+def random_turn(
+    key: jax.Array,
+    images: ArrayLike,
+    cameras: Camera,
+    points: ArrayLike,
+    *,
+    pan: ArrayLike = 0.35,
+    tilt: ArrayLike = 0.17,
+    probability: ArrayLike = 0.5,
+) -> tuple[jax.Array, Camera]:
+    """Images as if each camera had been turned a little about its own centre, with that camera.
+
+    A perspective augmentation that stays consistent: an object at the side of the frame is seen
+    under another angle than the camera's rotation suggests, and a policy whose rotation input is
+    in the camera's frame must learn which of the two counts. Compute the proprioception with the
+    camera that is returned.
+
+    Args:
+      key: PRNG key.
+      images: [B, H, W, 3] uint8 or float32.
+      cameras: the cameras that took them, leaves with a leading axis [B]; of a cropped image, see
+        `Camera.cropped`.
+      points: [B, 3] points that keep their pixels (the TCPs), metres in the world.
+      pan, tilt: largest angles, radians; see `Camera.turned`.
+      probability: chance of each image to be turned.
+
+    Returns:
+      images [B, H, W, 3] of the same dtype, and the turned cameras; images and cameras that are
+      not drawn are unchanged.
+
+    Raises:
+      ShapeError, DtypeError: not a batch of RGB images of uint8 or float; points not [B, 3].
+      OptionError: concrete angles outside 0 .. 1.5, or probability outside 0 .. 1.
+    """
+    images = as_image(images, "images", rank=4, rgb=True)
+    check_range(pan, "pan", 0.0, 1.5)
+    check_range(tilt, "tilt", 0.0, 1.5)
+    check_range(probability, "probability", 0.0, 1.0)
+    points = as_float(points, "points", (3,))
+    if points.shape[:-1] != images.shape[:1]:
+        raise ShapeError(
+            f"points: expected one for each of the {images.shape[0]} images, [B, 3], got "
+            f"{list(points.shape)}"
+        )
+    limits = jnp.asarray([pan, tilt], jnp.float32)
+    return _random_turn(key, images, cameras, points, limits, jnp.asarray(probability, jnp.float32))
+
+
+@jax.jit
+def _random_turn(
+    key: jax.Array,
+    images: jax.Array,
+    cameras: Camera,
+    points: jax.Array,
+    limits: jax.Array,
+    probability: jax.Array,
+) -> tuple[jax.Array, Camera]:
+    batch = images.shape[0]
+    angle_key, choice_key = jax.random.split(key)
+    chosen = jax.random.uniform(choice_key, (batch,)) < probability
+    angles = jax.random.uniform(angle_key, (batch, 2), minval=-1.0, maxval=1.0) * limits
+    angles = jnp.where(chosen[:, None], angles, 0.0)
+    turned = jax.vmap(lambda camera, a, point: camera.turned(a[0], a[1], point))(
+        cameras, angles, points
+    )
+    return _if_any(chosen, jax.vmap(_turn_view), images, cameras, turned, chosen), turned
 
 
 def _slack(full: int, size: int) -> float:

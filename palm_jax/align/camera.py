@@ -124,6 +124,26 @@ class Camera:
         moved = pose.at[:3, :3].set(rotation).at[:3, 3].set(position)
         return dataclasses.replace(self, cam_to_world=moved)
 
+    def turned(self, pan: ArrayLike, tilt: ArrayLike, keep: Vector) -> Camera:
+        """The camera turned about its own centre, with the image shifted to keep a point in place.
+
+        The pan is about the world's vertical, so that the horizon stays as level as it is; the tilt
+        about the camera's x axis. The principal point moves such that `keep` stays at its pixel:
+        what a TCP-centric window of a turned camera shows.
+
+        Args:
+          pan: radians, counter-clockwise seen from above.
+          tilt: radians, upwards.
+          keep: [3] point in the world, metres, in front of the camera before and after.
+        """
+        keep = as_single(keep, "keep", (3,))
+        pose = jnp.asarray(self.cam_to_world, jnp.float32)
+        rotation = matmul(matmul(rotation_z(pan), pose[:3, :3]), _rotation_x(tilt))
+        moved = dataclasses.replace(self, cam_to_world=pose.at[:3, :3].set(rotation))
+        shift = _project(self, keep)[0] - _project(moved, keep)[0]
+        intrinsics = jnp.asarray(self.K, jnp.float32).at[:2, 2].add(shift)
+        return dataclasses.replace(moved, K=intrinsics)
+
     def scaled(self, factor: float | tuple[float, float]) -> Camera:
         """The same view with `factor` times the pixels per side (a pair: horizontal, vertical).
 
@@ -166,6 +186,14 @@ def rotation_z(angle: ArrayLike) -> jax.Array:
     c, s = jnp.cos(angle), jnp.sin(angle)
     zero, one = jnp.zeros_like(c), jnp.ones_like(c)
     return jnp.stack([c, -s, zero, s, c, zero, zero, zero, one], -1).reshape(*c.shape, 3, 3)
+
+
+def _rotation_x(angle: ArrayLike) -> jax.Array:
+    """[3, 3] rotation by `angle` [] (radians) about x."""
+    angle = jnp.asarray(angle, jnp.float32)
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    zero, one = jnp.zeros_like(c), jnp.ones_like(c)
+    return jnp.stack([one, zero, zero, zero, c, -s, zero, s, c]).reshape(3, 3)
 
 
 def inside(camera: Camera, uv: jax.Array, depth: jax.Array) -> jax.Array:

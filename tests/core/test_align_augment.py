@@ -12,13 +12,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palm_jax.align import (
+    Camera,
     center_crop,
     overlay_blend,
     perspective_warp,
+    project,
     random_crop,
     random_overlay,
     random_perspective,
+    random_turn,
     subpixel_crop,
+    turn_view,
 )
 
 FULL = np.array([[0, 0], [26, 0], [26, 20], [0, 20]], np.float32)
@@ -175,6 +179,64 @@ def test_random_perspective_reach():
     # The four corners move independently.
     pulled = [out[:, row, column, 0] < 0.5 for row, column in ((2, 4), (2, -5), (-3, 4), (-3, -5))]
     assert len({tuple(corner) for corner in pulled}) == 4 and all(corner.any() for corner in pulled)
+
+
+def window_camera(rng, height=20, width=26):
+    """A camera that sees the origin in a small, cropped image."""
+    eye = np.array([1.0, 0.0, 0.8]) + 0.2 * rng.normal(size=3)
+    centre = rng.uniform(8, 14, 2)
+    intrinsics = np.array([[40, 0.5, centre[0]], [0, 42, centre[1]], [0, 0, 1]])
+    looking = oracles.looking_at(eye, np.zeros(3))
+    return Camera(np.float32(intrinsics), np.float32(looking), height, width)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_turn_view(dtype):
+    rng = np.random.default_rng(3)
+    examples = []
+    for image, (pan, tilt) in zip(
+        images(3, dtype=dtype), ((0.3, 0.1), (-0.25, 0.0), (0.1, -0.2)), strict=True
+    ):
+        camera = window_camera(rng)
+        turned = jax.tree.map(np.asarray, camera.turned(pan, tilt, 0.05 * rng.normal(size=3)))
+        examples.append((image, camera, turned))
+
+    def compare(got, expected):
+        scale = 255 if got.dtype == np.uint8 else 1
+        np.testing.assert_allclose(got, expected, atol=2e-4 * scale + (0.5 if scale > 1 else 0))
+
+    check_op(turn_view, oracles.turn_view, examples, compare=compare)
+
+
+def test_random_turn():
+    """About half are turned, within the limits; the points keep their pixels, the rest stays."""
+    rng = np.random.default_rng(4)
+    count, x = 300, images(300)
+    one = window_camera(rng)
+    cameras = jax.tree.map(lambda leaf: np.repeat(leaf[None], count, 0), one)
+    points = (0.1 * rng.normal(size=(count, 3))).astype(np.float32)
+    out, turned = random_turn(jax.random.key(0), x, cameras, points, pan=0.3, tilt=0.1)
+    moved = (np.asarray(out) != x).any((1, 2, 3))
+    assert abs(moved.sum() - 150) < 45
+    seen, place = (
+        jax.vmap(lambda camera, point: project(camera, point)[0])(c, points)
+        for c in (cameras, turned)
+    )
+    np.testing.assert_allclose(seen, place, atol=1e-3)
+    pose = np.asarray(turned.cam_to_world)
+    same = np.isclose(pose, one.cam_to_world, atol=1e-6).all((1, 2))
+    np.testing.assert_array_equal(same, ~moved)
+    np.testing.assert_array_equal(pose[:, :3, 3], np.asarray(cameras.cam_to_world)[:, :3, 3])
+    # The pan turns the x axis in the ground plane, the tilt turns z about it.
+    x0, x1 = one.cam_to_world[:2, 0], pose[moved][:, :2, 0]
+    pans = np.arctan2(x0[0] * x1[:, 1] - x0[1] * x1[:, 0], x1 @ x0)
+    tilts = np.arcsin(pose[moved][:, 2, 2]) - np.arcsin(one.cam_to_world[2, 2])
+    for angles, limit in ((pans, 0.3), (tilts, 0.1)):
+        assert np.abs(angles).max() <= limit + 1e-3
+        assert angles.min() < -0.9 * limit and angles.max() > 0.9 * limit
+    assert abs(np.corrcoef(pans, tilts)[0, 1]) < 0.25
+    still, _ = random_turn(jax.random.key(0), x, cameras, points, probability=0.0)
+    np.testing.assert_array_equal(still, x)
 
 
 def test_random_crop_covers_all_positions():

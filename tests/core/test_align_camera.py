@@ -140,6 +140,19 @@ def test_rotated_about_turns_counter_clockwise_and_carries_the_scene():
     )
 
 
+@given(SEEDS, st.floats(-0.4, 0.4), st.floats(-0.3, 0.3))
+def test_turned_keeps_the_place_the_horizon_and_a_point(seed, pan, tilt):
+    rng = np.random.default_rng(seed)
+    camera = random_camera(rng)
+    keep = 0.2 * rng.normal(size=3)
+    turned = camera.turned(pan, tilt, keep)
+    expected = oracles.turned_pose(camera.cam_to_world, pan, tilt)
+    np.testing.assert_allclose(turned.cam_to_world, expected, atol=1e-6)
+    np.testing.assert_allclose(project(turned, keep)[0], project(camera, keep)[0], atol=2e-3)
+    np.testing.assert_allclose(turned.cam_to_world[2, 0], camera.cam_to_world[2, 0], atol=1e-6)
+    np.testing.assert_array_equal(turned.K[:2, :2], np.asarray(camera.K)[:2, :2])
+
+
 def test_scaled_and_cropped_move_pixels():
     camera, point = front_camera(), np.array([0.3, 0.1, 0.8])
     uv = np.asarray(project(camera, point)[0])

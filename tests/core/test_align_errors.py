@@ -330,6 +330,24 @@ CASES = [
         ["probability", "2"],
     ),
     (
+        "turned camera elsewhere",
+        lambda: pa.turn_view(IMAGE, CAMERA, camera_with(cam_to_world=tcp_at(0.0, 0.0, 0.1))),
+        pa.CameraError,
+        ["place of the first", "0.1000 m"],
+    ),
+    (
+        "pan in degrees",
+        lambda: pa.random_turn(KEY, BATCH, CAMERA, np.zeros((4, 3)), pan=20),
+        pa.OptionError,
+        ["pan", "20"],
+    ),
+    (
+        "points of another batch",
+        lambda: pa.random_turn(KEY, BATCH, CAMERA, np.zeros((3, 3))),
+        pa.ShapeError,
+        ["each of the 4 images", "[3, 3]"],
+    ),
+    (
         "corners out of order",
         lambda: pa.perspective_warp(IMAGE, np.array([[0, 0], [0, 9], [9, 9], [9, 0]])),
         pa.OptionError,

@@ -25,6 +25,8 @@ def test_presets_are_whole(name: str) -> None:
         # A method without augmentation is trained without any of it.
         assert (learner.overlay_fraction > 0) == method.augment
         assert (learner.perspective_probability > 0) == method.augment
+        assert (max(learner.turn) > 0) == (method.augment and max(config.turn) > 0)
+        assert learner.turn_proprio == (method.layout == "cam6d_z")
 
 
 def test_the_papers_numbers() -> None:

@@ -14,6 +14,7 @@ import pytest
 import worlds
 from oracles import delta
 
+from palm_jax.align import project
 from palm_jax.train import demos
 from palm_jax.train.demos import DemoFileError
 
@@ -215,10 +216,14 @@ def test_an_expert_that_fails_is_no_endless_loop(
 def test_pictures_are_rendered_from_states(recorded: Path) -> None:
     """Any number of frames, whatever the batch; a plain spec sees what `Env.observe` sees."""
     runner, found = worlds.runner("lift_spam"), load(recorded)
-    images, proprio = demos.render_observations(runner, found, worlds.SPEC, frame=1024)
+    images, proprio, cameras = demos.render_observations(runner, found, worlds.SPEC, frame=1024)
     assert images.shape == (len(found.qpos), 84, 84, 3) and images.dtype == np.uint8
     assert proprio.shape == (len(found.qpos), worlds.SPEC.proprio_size)
     np.testing.assert_allclose(proprio[:, 6], found.tcp[:, 2, 3], atol=1e-5)
+    # In every image the TCP is where the crop puts it: 40 of 200 pixels above the middle.
+    uv = jax.vmap(lambda camera, tcp: project(camera, tcp[:3, 3])[0])(cameras, found.tcp)
+    middle = np.array([42.0, 42.0 - 40 * 84 / worlds.SPEC.crop])
+    assert np.abs(np.asarray(uv) - middle).max() <= 1.0
     start = int(np.flatnonzero(found.episode == 3)[0])
     # The first frame of an episode, drawn from its restored state.
     rows = np.full(worlds.WORLDS, start)

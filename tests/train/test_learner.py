@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from palm_jax import align
 from palm_jax.train import checkpoint, learner
 from palm_jax.train.learner import Batch, LearnerConfig, Normalizer, TrainState
 
@@ -184,6 +185,7 @@ def test_to_action_by_hand() -> None:
         ({"learning_rate": float("nan")}, "learning_rate is nan"),
         ({"overlay_fraction": 1.5}, "overlay_fraction is 1.5; expected 0 to 1"),
         ({"ema": 1.0}, "ema is 1.0"),
+        ({"turn": (20.0, 10.0)}, "turn is .20.0, 10.0.; expected pan and tilt from 0 to 1.5"),
     ],
 )
 def test_configuration_errors(change: dict[str, Any], message: str) -> None:
@@ -408,6 +410,47 @@ def test_overlay_waits_for_its_warm_up_in_one_compilation(full: learner.Learner)
     assert loss(1, BANK) == loss(1, other)
     assert loss(2, BANK) != loss(2, other)
     assert len(TRACES) == 1  # for all tests so far
+
+
+def test_a_turned_camera_turns_the_rotation_input_along() -> None:
+    """Images and proprioception are those that `align` gives for the camera that is returned."""
+    rng = np.random.default_rng(5)
+    base = align.Camera.from_fovy(40.0, SIDE, SIDE, np.eye(4)).turned(0.3, 0.2, np.ones(3))
+    count = 8
+    cameras = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], count, 0), base)
+    tcp = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1))
+    tcp[:, :3, :3] = align.matrix_from_6d(rng.normal(size=(count, 6)).astype(np.float32))
+    tcp[:, :3, 3] = [0.5, 0.4, 1.2] + 0.02 * rng.normal(size=(count, 3))
+
+    def proprio(cameras: align.Camera) -> Any:
+        return jax.vmap(lambda pose, c: align.proprio(pose, 1.0, c, layout="cam6d_z"))(tcp, cameras)
+
+    data = Batch(
+        {"front": make_data(count=count).images["front"]},
+        np.asarray(proprio(cameras)),
+        DATA.actions[:count],
+        cameras={"front": cameras},
+        tcp=tcp[:, :3, 3],
+    )
+    config = dataclasses.replace(BARE, turn=(0.4, 0.2), turn_probability=0.7)
+    key = jax.random.key(1)
+    out = learner._turned_views(key, data, "front", config)
+    images, turned = align.random_turn(
+        jax.random.fold_in(key, 0), data.images["front"], cameras, data.tcp,
+        pan=0.4, tilt=0.2, probability=0.7,
+    )  # fmt: skip
+    np.testing.assert_array_equal(out.images["front"], images)
+    np.testing.assert_allclose(out.proprio, proprio(turned), atol=1e-5)
+    assert (np.abs(out.proprio - data.proprio).max(1) > 1e-3).sum() >= 3
+    world = dataclasses.replace(config, turn_proprio=False)
+    same = learner._turned_views(key, data, "front", world)
+    np.testing.assert_array_equal(same.proprio, data.proprio)
+
+
+def test_turning_needs_cameras() -> None:
+    made = learner.make_learner(dataclasses.replace(BARE, turn=(0.1, 0.0)), P)
+    with pytest.raises(ValueError, match=r"needs those of \['front'\].*turn=\(0, 0\)"):
+        learner.run(made, DATA, seed=0, steps=1)
 
 
 def test_randomness_is_of_key_and_step(full: learner.Learner) -> None:
