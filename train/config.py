@@ -85,7 +85,7 @@ class Config:
     ema: float = 0.99
     overlay_warmup: int = 800
     perspective: float = 0.2
-    turn: tuple[float, float] = (20.0, 10.0)
+    turn: tuple[float, float] = (30.0, 10.0)
     backgrounds: Path | None = None
     checkpoint_every: int = 600
     select_from: float = 0.7

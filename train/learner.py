@@ -85,8 +85,13 @@ class LearnerConfig:
     perspective_distortion: float = 0.2
     perspective_probability: float = 0.5  # per sample; 0 for no random perspective
     turn: tuple[float, float] = (0.0, 0.0)  # largest pan and tilt of `align.random_turn`, radians
-    turn_probability: float = 0.5  # per sample
+    turn_probability: float = 0.8  # per sample; 0 for none
     turn_proprio: bool = True  # proprioception begins with the 6D rotation seen by the camera
+
+    @property
+    def turns(self) -> bool:
+        """Whether training images are turned, which needs their cameras."""
+        return self.turn_probability > 0 and max(self.turn) > 0
 
     def __post_init__(self) -> None:
         for name, known in (
@@ -399,7 +404,7 @@ class Learner:
         """
         check_batch(batch, self.proprio_dim, self.views, self.config.crop)
         image_key, proprio_key = jax.random.split(jax.random.fold_in(key, state.step))
-        if max(self.config.turn) > 0:
+        if self.config.turns:
             _check_cameras(batch, self.views)
             turn_key = jax.random.fold_in(image_key, len(self.views))
             batch = _turned_views(turn_key, batch, self.views[0], self.config)
@@ -729,7 +734,7 @@ def run(
             "the configuration has a random overlay, but no bank of backgrounds was given; "
             "pass one, e.g. align.procedural_bank(...), or set overlay_fraction=0"
         )
-    if max(config.turn) > 0:
+    if config.turns:
         _check_cameras(data, learner.views)
     keys = RunKeys.from_seed(seed)
     if state is None:
