@@ -85,7 +85,7 @@ class Config:
     ema: float = 0.99
     overlay_warmup: int = 800
     perspective: float = 0.2
-    turn: tuple[float, float] = (30.0, 10.0)
+    turn: tuple[float, float] = (0.0, 0.0)
     backgrounds: Path | None = None
     checkpoint_every: int = 600
     select_from: float = 0.7
@@ -172,6 +172,7 @@ def cpu() -> Config:
         scenes=50,
         overlay_warmup=1500,
         perspective=0.1,
+        turn=(30.0, 10.0),
     )
 
 
@@ -201,7 +202,6 @@ def paper() -> Config:
         scenes=50,
         overlay_warmup=1_600,
         perspective=0.2,
-        turn=(0.0, 0.0),
     )
 
 
