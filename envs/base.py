@@ -347,20 +347,18 @@ class Env:
         Only the pixels of the policy's window are rendered, at the policy's resolution. `frame` is
         the side of the virtual full image that a `border="shift"` window must stay inside.
         """
-        view = spec.view_camera(self.camera(state, params, frame=frame))
-        tcp = self.tcp(state)
-        origin, _ = window_origin(view, tcp, spec)
+        view, origin = self._window(state, params, spec, frame)
         window = Window(origin, spec.size, spec.size)
         image = render(self.scene(state, params), view, window).rgb
         assert image is not None
-        return align_window(image, view, origin, tcp, self.opening(state), spec)
+        return align_window(image, view, origin, self.tcp(state), self.opening(state), spec)
 
     def window_camera(
         self, state: State, params: EnvParams, spec: AlignSpec, *, frame: int = WIDE_FRAME
     ) -> Camera:
-        """The camera of the image that `observe` gives: size x size pixels, the TCP where it is."""
-        view = spec.view_camera(self.camera(state, params, frame=frame))
-        origin, _ = window_origin(view, self.tcp(state), spec)
+        """The camera of the image that `observe` gives: K [3, 3] in pixels of the size x size
+        window, cam_to_world [4, 4] in metres."""
+        view, origin = self._window(state, params, spec, frame)
         return view.cropped(origin[::-1].astype(jnp.float32), spec.size, spec.size)
 
     def render(self, state: State, params: EnvParams, size: int, **options: Any) -> Frame:
@@ -369,6 +367,14 @@ class Env:
         return render(self.scene(state, params), camera, **options)
 
     # -- internals ---------------------------------------------------------------------------------
+
+    def _window(
+        self, state: State, params: EnvParams, spec: AlignSpec, frame: int
+    ) -> tuple[Camera, jax.Array]:
+        """The frame at the policy's resolution, and the origin int32 [2] (row, col) of its window
+        in it, pixels."""
+        view = spec.view_camera(self.camera(state, params, frame=frame))
+        return view, window_origin(view, self.tcp(state), spec)[0]
 
     def _home_qpos(self) -> jax.Array:
         qpos = jnp.asarray(self.mj_model.qpos0, jnp.float32)

@@ -140,8 +140,11 @@ class Config:
             raise ConfigError(f"backgrounds: {self.backgrounds} is not a folder")
         if not all(0 <= angle <= 80 for angle in self.turn):
             raise ConfigError(f"turn: expected degrees from 0 to 80, got {self.turn}")
-        for method in self.method:
-            self.learner(methods.find(method))
+        try:
+            for method in self.method:
+                self.learner(methods.find(method))
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
 
 
 def _known(what: str, names: Iterable[str], known: Collection[str]) -> None:

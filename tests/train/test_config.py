@@ -85,6 +85,8 @@ def test_folders_are_named_after_what_is_in_them() -> None:
         (["--method", "palm", "bcc"], r"unknown method 'bcc' .*known: palm.*bc"),
         (["--domains", "in_domain", "lights"], "unknown domain 'lights'.*known: in_domain"),
         (["--domains", "viewpoint"], "domains must contain in_domain"),
+        (["--turn", "90", "0"], r"turn: expected degrees from 0 to 80, got \(90.0, 0.0\)"),
+        (["--learning-rate", "-1"], "learning_rate is -1.0; expected 0 or more"),
         (["--stepps", "3"], r"unknown option --stepps \(did you mean --steps\?\); known: .*--task"),
         (["--steps", "0"], "steps: expected at least 1, got 0"),
         (["--scenes=-1"], "scenes: expected at least 1, got -1"),
