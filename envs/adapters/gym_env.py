@@ -21,8 +21,10 @@ import numpy as np
 
 from palm_jax.align import AlignSpec
 from palm_jax.envs import registry, shifts
-from palm_jax.envs.base import CONTROL_RATE, WIDE_FRAME, Env, EnvParams, State
-from palm_jax.envs.rollout import Runner, repeat_params
+from palm_jax.envs.adapters.domains import check_domain, scene
+from palm_jax.envs.base import CONTROL_RATE, WIDE_FRAME, Env, State
+from palm_jax.envs.params import EnvParams, check_params, repeat_params
+from palm_jax.envs.rollout import Runner
 
 try:
     import gymnasium
@@ -43,7 +45,6 @@ RENDER_SIZE = 256
 """Side in pixels of the frames that `render` returns."""
 
 _ROTATION = 1.001  # entries of a rotation, with room for float32
-_OPTIONS = ("domain", "params")
 
 Observation = dict[str, np.ndarray]
 Seeds = int | Sequence[int | None] | None
@@ -54,10 +55,20 @@ class _Worlds:
 
     Every world has a random generator of its own that draws one seed an episode. What a world
     shows therefore depends on its seed and on how often it was reset, not on its neighbours.
+
+    Attributes:
+      params: leading [W], of the worlds' present episodes.
+      state: leading [W]; None before the first episode.
     """
 
     def __init__(
-        self, runner: Runner, params: EnvParams, spec: AlignSpec, frame: int, horizon: int | None
+        self,
+        runner: Runner,
+        params: EnvParams | None,
+        domain: str,
+        spec: AlignSpec,
+        frame: int,
+        horizon: int | None,
     ) -> None:
         self.runner, self.spec, self.frame = runner, spec, frame
         self.horizon = runner.env.task.horizon if horizon is None else horizon
@@ -67,10 +78,13 @@ class _Worlds:
         self.generators = [seeding.np_random()[0] for _ in range(self.count)]
         self.steps = np.zeros(self.count, int)
         self.state: State | None = None
-        self.params = self._default = self._per_world(params)
+        check_domain(domain)
+        params = runner.env.default_params() if params is None else params
+        self._default = self._source = self._per_world(params), domain
+        self.params = self._source[0]
         # A reset of the batch costs the same for one world as for all, so it makes a start for
         # every world, to be used when that world's turn comes.
-        self._starts: State | None = None
+        self._starts: tuple[State, EnvParams] | None = None
         self._seeds = np.zeros(self.count, np.uint32)  # of those starts
         self._unused = np.zeros(self.count, bool)
 
@@ -78,6 +92,7 @@ class _Worlds:
         """`params` with a leading [W]; they may have it already."""
         # Weakly typed numbers would compile everything anew.
         params = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), params)
+        check_params(params)
         shape = params.camera_fovy.shape
         if shape == ():
             return repeat_params(params, self.count)
@@ -91,9 +106,9 @@ class _Worlds:
     def reset(self, seed: Seeds, options: dict[str, Any] | None) -> None:
         """A new episode in all worlds, under `options` until the next call."""
         self._seed(seed)
-        params = self._optional(options or {})
-        if params is not self.params:
-            self.params, self._starts = params, None
+        source = self._optional(options or {})
+        if source is not self._source:
+            self._source, self._starts = source, None
         self.start(np.ones(self.count, bool))
 
     def _seed(self, seed: Seeds) -> None:
@@ -110,30 +125,32 @@ class _Worlds:
                 self.generators[world] = seeding.np_random(one)[0]
                 self._unused[world] = False
 
-    def _optional(self, options: dict[str, Any]) -> EnvParams:
-        unknown = set(options) - set(_OPTIONS)
-        if unknown or len(options) > 1:
-            raise ValueError(f"options: expected one of {', '.join(_OPTIONS)}; got {list(options)}")
-        if "params" in options:
-            return self._per_world(options["params"])
-        if "domain" in options:
-            params = shifts.shifted(self.runner.env.default_params(), options["domain"])
-            return self._per_world(params)
-        return self._default
+    def _optional(self, options: dict[str, Any]) -> tuple[EnvParams, str]:
+        """Where the episodes take place: params [W], and the domain on top of them."""
+        if unknown := set(options) - {"domain", "params"}:
+            raise ValueError(f"options: expected domain or params, got {sorted(unknown)}")
+        if not options:
+            return self._default
+        check_domain(domain := options.get("domain", shifts.IN_DOMAIN))
+        params = self._default[0]
+        return self._per_world(options["params"]) if "params" in options else params, domain
 
     def start(self, which: np.ndarray) -> None:
         """A new episode in the worlds `which` (bool [W])."""
         if self._starts is None or not self._unused[which].all():
             for world in np.flatnonzero(~self._unused):
                 self._seeds[world] = self.generators[world].integers(2**32)
-            keys = jax.vmap(jax.random.key)(self._seeds)
-            self._starts = self.runner.reset(keys, self.params)
+            source, domain = self._source
+            params = _scenes(domain)(jax.vmap(jax.random.key)(self._seeds), source)
+            state = self.runner.reset(jax.vmap(jax.random.key)(self._seeds), params)
+            self._starts = state, params
             self._unused[:] = True
         self._unused[which] = False
         self.steps[which] = 0
-        self.state = (
-            self._starts if self.state is None else _choose(which, self._starts, self.state)
-        )
+        if self.state is None:
+            self.state, self.params = self._starts
+        else:
+            self.state, self.params = _choose(which, self._starts, (self.state, self.params))
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """One control step of actions [W, 10]: (reward, terminated, truncated), each [W]."""
@@ -169,9 +186,15 @@ class _Worlds:
         return self.state
 
 
+@functools.cache
+def _scenes(domain: str) -> Callable[[jax.Array, EnvParams], EnvParams]:
+    """(keys [W], params [W]) -> the params of an episode in each world."""
+    return jax.jit(jax.vmap(functools.partial(scene, domain=domain)))
+
+
 @jax.jit
-def _choose(which: jax.Array, these: State, others: State) -> State:
-    """The states `these` of the worlds `which` [W], and `others` of the rest."""
+def _choose(which: jax.Array, these: Any, others: Any) -> Any:
+    """Of two trees with leading [W]: `these` in the worlds `which`, `others` in the rest."""
 
     def pick(this: jax.Array, other: jax.Array) -> jax.Array:
         return jnp.where(which.reshape(-1, *(1,) * (this.ndim - 1)), this, other)
@@ -243,6 +266,7 @@ class PalmVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, np.ndarr
         runner: Runner,
         *,
         params: EnvParams | None = None,
+        domain: str = "in_domain",
         spec: AlignSpec | None = None,
         frame: int = WIDE_FRAME,
         horizon: int | None = None,
@@ -255,6 +279,8 @@ class PalmVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, np.ndarr
           runner: what steps them.
           params: of one world, or with a leading axis of one world each; the environment's
             defaults by default.
+          domain: what shifts on top of them, see `palm_jax.envs.shifts.scenes`; every episode has
+            its own place on the domain's axes.
           spec: the observation; the task's TCP crop by default.
           frame: side in pixels of the virtual image that the crop must stay inside.
           horizon: control steps until truncation; the task's by default.
@@ -262,7 +288,8 @@ class PalmVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, np.ndarr
           autoreset_mode: "NextStep" or "SameStep".
 
         Raises:
-          ValueError: a mode that does not exist, params for another number of worlds.
+          ValueError: a mode or a domain that does not exist, params for another number of worlds
+            or impossible ones.
         """
         mode = AutoresetMode(autoreset_mode)
         if mode == AutoresetMode.DISABLED:
@@ -277,8 +304,7 @@ class PalmVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, np.ndarr
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        params = runner.env.default_params() if params is None else params
-        self._worlds = _Worlds(runner, params, spec, frame, horizon)
+        self._worlds = _Worlds(runner, params, domain, spec, frame, horizon)
         self._ended = np.zeros(self.num_envs, bool)
 
     def reset(
@@ -288,11 +314,12 @@ class PalmVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, np.ndarr
 
         Args:
           seed: a number s for s, s + 1, ..., or one a world (None: goes on as it was).
-          options: {"domain": a name of `shifts.shifted`} or {"params": EnvParams}: where this and
-            the following episodes take place, until the next call of `reset`.
+          options: "domain" (its name) or "params" (`EnvParams`) or both: where this and the
+            following episodes take place, until the next call of `reset`; what the environment
+            was made with without them.
 
         Raises:
-          ValueError: other options, an unknown shift, another number of seeds.
+          ValueError: other options or impossible ones, another number of seeds.
           StartPoseError: the params ask for start poses that the arm cannot take.
         """
         super().reset(seed=seed if isinstance(seed, int) else None)
@@ -327,6 +354,11 @@ class PalmVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, np.ndarr
         """The states of the worlds (leading [W]): `runner.expert(state)` acts from them."""
         return self._worlds.running()
 
+    @property
+    def params(self) -> EnvParams:
+        """The params of the worlds' present episodes (leading [W])."""
+        return self._worlds.params
+
     def render(self) -> tuple[np.ndarray, ...]:
         """The frame [256, 256, 3] uint8 of every world's camera."""
         _check_rendering(self.render_mode)
@@ -358,6 +390,7 @@ class PalmEnv(gymnasium.Env[Observation, np.ndarray]):
         runner: Runner,
         *,
         params: EnvParams | None = None,
+        domain: str = "in_domain",
         spec: AlignSpec | None = None,
         frame: int = WIDE_FRAME,
         horizon: int | None = None,
@@ -372,8 +405,7 @@ class PalmEnv(gymnasium.Env[Observation, np.ndarray]):
         spec = _default_spec(runner.env, spec)
         self.observation_space = observation_space(runner.env, spec)
         self.action_space = action_space()
-        params = runner.env.default_params() if params is None else params
-        self._worlds = _Worlds(runner, params, spec, frame, horizon)
+        self._worlds = _Worlds(runner, params, domain, spec, frame, horizon)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -418,34 +450,24 @@ def _runner(task: str, robot: str, worlds: int) -> Runner:
     return Runner(registry.make(task, robot), worlds)
 
 
-def make_vec(
-    task: str,
-    robot: str = "panda",
-    num_envs: int = 16,
-    domain: str = "in_domain",
-    **options: Any,
-) -> PalmVectorEnv:
+def make_vec(task: str, robot: str = "panda", num_envs: int = 16, **options: Any) -> PalmVectorEnv:
     """A batch of worlds of a task on a robot.
 
     Args:
       task, robot: see `palm_jax.envs.make`.
       num_envs: worlds.
-      domain: see `palm_jax.envs.shifts.shifted`.
-      options: spec, frame, horizon, render_mode, autoreset_mode, as in `PalmVectorEnv`.
+      options: params, domain, spec, frame, horizon, render_mode, autoreset_mode, as in
+        `PalmVectorEnv`.
 
     Raises:
       ValueError: a name that does not exist, too many worlds for one batch on a CPU.
     """
-    runner = _runner(task, robot, num_envs)
-    params = shifts.shifted(runner.env.default_params(), domain)
-    return PalmVectorEnv(runner, params=params, **options)
+    return PalmVectorEnv(_runner(task, robot, num_envs), **options)
 
 
-def make_env(task: str, robot: str = "panda", domain: str = "in_domain", **options: Any) -> PalmEnv:
-    """One world of a task on a robot; arguments and errors as in `make_vec`."""
-    runner = _runner(task, robot, 1)
-    params = shifts.shifted(runner.env.default_params(), domain)
-    return PalmEnv(runner, params=params, **options)
+def make_env(task: str, robot: str = "panda", **options: Any) -> PalmEnv:
+    """One world of a task on a robot; options and errors as in `make_vec`."""
+    return PalmEnv(_runner(task, robot, 1), **options)
 
 
 def register_all() -> None:

@@ -14,9 +14,11 @@ import mujoco
 from mujoco import mjx
 
 from palm_jax.align import AlignSpec
-from palm_jax.envs import registry, shifts
-from palm_jax.envs.base import CONTROL_RATE, WIDE_FRAME, Env, EnvParams
+from palm_jax.envs import registry
+from palm_jax.envs.adapters.domains import check_domain, scene
+from palm_jax.envs.base import CONTROL_RATE, WIDE_FRAME, Env
 from palm_jax.envs.base import State as EnvState
+from palm_jax.envs.params import EnvParams, check_params
 from palm_jax.envs.world import asset_path
 
 try:
@@ -36,9 +38,9 @@ class PlaygroundEnv(MjxEnv):
     image, float32 [size, size, 3] in 0..1}. The reward is 1 on the step that solves the task;
     `done` is 1 once it is solved or physics has diverged. Actions are those of `Env`, in metres.
 
-    `info["episode"]` holds the rest of `Env`'s state, `info["start"]` what it was at the start:
-    Playground's auto-reset puts back `data` and `obs` alone, and the next step notices by the time
-    of `data` that an episode begins.
+    `info["params"]` holds the episode's `EnvParams`, `info["episode"]` the rest of `Env`'s state
+    and `info["start"]` what that was at the start: Playground's auto-reset puts back `data` and
+    `obs` alone, and the next step notices by the time of `data` that an episode begins.
 
     Domain randomisation may replace any field of the MJX model that physics alone reads: masses,
     inertias, gains, damping and friction (`pair_friction`: every contact is an explicit pair, so
@@ -51,6 +53,7 @@ class PlaygroundEnv(MjxEnv):
         env: Env,
         *,
         params: EnvParams | None = None,
+        domain: str = "in_domain",
         spec: AlignSpec | None = None,
         frame: int = WIDE_FRAME,
         vision: bool = False,
@@ -60,10 +63,16 @@ class PlaygroundEnv(MjxEnv):
         Args:
           env: the environment.
           params: of one world; what every reset draws from. The defaults by default.
+          domain: what shifts on top of them, see `palm_jax.envs.shifts.scenes`; every reset draws
+            its own place on the domain's axes.
           spec: the observation; the task's TCP crop by default.
           frame: side in pixels of the virtual image that the crop must stay inside.
           vision: whether images are rendered.
+
+        Raises:
+          ValueError: a domain that does not exist, impossible params.
         """
+        check_domain(domain)
         config = config_dict.create(
             ctrl_dt=1.0 / CONTROL_RATE,
             sim_dt=float(env.mj_model.opt.timestep),
@@ -75,6 +84,8 @@ class PlaygroundEnv(MjxEnv):
         super().__init__(config)
         self._env = env
         self._params = env.default_params() if params is None else params
+        check_params(self._params)
+        self._domain = domain
         self._spec = AlignSpec(crop=env.task.crop) if spec is None else spec
         self._frame = frame
         self._vision = vision
@@ -87,16 +98,18 @@ class PlaygroundEnv(MjxEnv):
         A start pose out of the arm's reach cannot raise here: `metrics["reachable"]` is 0.
         """
         typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
+        key = rng if typed else jax.random.wrap_key_data(rng)
         env = self._randomised()
-        world = env.reset(rng if typed else jax.random.wrap_key_data(rng), self._params)
+        params = scene(jax.random.clone(key), self._params, self._domain)
+        world = env.reset(key, params)
         rest = _without_data(world)
-        info = {"rng": rng, "episode": rest, "start": rest}
+        info = {"rng": rng, "params": params, "episode": rest, "start": rest}
         return self._state(env, world, jnp.zeros(()), info)
 
     def step(self, state: State, action: jax.Array) -> State:
         """One control step of an action [10]."""
         env, before = self._randomised(), self.world(state)
-        after = env.step(before, action, self._params)
+        after = env.step(before, action, state.info["params"])
         reward = (after.success & ~before.success).astype(jnp.float32)
         info = {**state.info, "episode": _without_data(after)}
         result = self._state(env, after, reward, info)
@@ -115,11 +128,11 @@ class PlaygroundEnv(MjxEnv):
 
     def _state(self, env: Env, world: EnvState, reward: jax.Array, info: dict[str, Any]) -> State:
         done = (world.success | world.nan).astype(jnp.float32)
-        obs = self._observe(env, world)
+        obs = self._observe(env, world, info["params"])
         return State(world.data, obs, reward, done, self._metrics(world), info)
 
-    def _observe(self, env: Env, world: EnvState) -> dict[str, jax.Array]:
-        seen = env.observe(world, self._params, self._spec, frame=self._frame)
+    def _observe(self, env: Env, world: EnvState, params: EnvParams) -> dict[str, jax.Array]:
+        seen = env.observe(world, params, self._spec, frame=self._frame)
         # Without `vision` nothing uses the image, and the compiler drops its rendering.
         obs = {"state": seen.proprio}
         if self._vision:
@@ -156,18 +169,14 @@ def _without_data(world: EnvState) -> Any:
     return dataclasses.replace(world, data=None)
 
 
-def make_env(
-    task: str, robot: str = "panda", domain: str = "in_domain", **options: Any
-) -> PlaygroundEnv:
-    """A task on a robot, in a domain.
+def make_env(task: str, robot: str = "panda", **options: Any) -> PlaygroundEnv:
+    """A task on a robot.
 
     Args:
       task, robot: see `palm_jax.envs.make`.
-      domain: see `palm_jax.envs.shifts.shifted`.
-      options: spec, frame, vision, as in `PlaygroundEnv`.
+      options: params, domain, spec, frame, vision, as in `PlaygroundEnv`.
 
     Raises:
-      ValueError: a name that does not exist.
+      ValueError: a name that does not exist, impossible params.
     """
-    env = registry.make(task, robot)
-    return PlaygroundEnv(env, params=shifts.shifted(env.default_params(), domain), **options)
+    return PlaygroundEnv(registry.make(task, robot), **options)

@@ -1,5 +1,6 @@
 """The Gymnasium adapter: Gymnasium's checkers, its own vector environment, and the plain Runner."""
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -242,6 +243,24 @@ def test_options_hold_until_the_next_reset() -> None:
     np.testing.assert_allclose(turns(), np.linspace(0.1, 0.4, worlds.WORLDS), rtol=1e-6)
 
 
+def test_every_episode_has_its_own_scene() -> None:
+    """A world's place on an axis is drawn anew with its episode, and only then."""
+    envs = vector(domain="field_of_view", autoreset_mode="SameStep")
+    envs.reset(seed=0)
+    first = np.asarray(envs.params.camera_fovy)
+    assert len(set(first.tolist())) == worlds.WORLDS
+    action = moves(6, 1)[0]
+    action[0, 6] = np.nan
+    image = envs.step(action)[0]["image"]
+    seen = envs.runner.observe(envs.state, envs.params, worlds.SPEC)
+    np.testing.assert_array_equal(image, seen.image)
+    now = np.asarray(envs.params.camera_fovy)
+    np.testing.assert_array_equal(now[1:], first[1:])
+    assert now[0] != first[0]
+    envs.reset(seed=0)
+    np.testing.assert_array_equal(envs.params.camera_fovy, first)
+
+
 def test_frames_of_every_world() -> None:
     envs = vector(render_mode="rgb_array")
     envs.reset(seed=0)
@@ -282,6 +301,7 @@ def test_bad_input_is_told() -> None:
         ({"autoreset_mode": "Disabled"}, "expected 'NextStep' or 'SameStep'"),
         ({"render_mode": "human"}, "expected None or 'rgb_array', got 'human'"),
         ({"horizon": 0}, "at least one control step"),
+        ({"domain": "workspace+embodiment"}, "pass its name as robot=, and the domain 'workspace'"),
     ]:
         with pytest.raises(ValueError, match=message):
             vector(**wrong)
@@ -290,11 +310,14 @@ def test_bad_input_is_told() -> None:
         envs.step(moves(0, 1)[0])
     with pytest.raises(gymnasium.error.Error, match="pass render_mode='rgb_array'"):
         envs.render()
+    blind = dataclasses.replace(envs.runner.env.default_params(), camera_fovy=np.float32(0.0))
     two = jax.tree.map(lambda x: x[:2], worlds.params(envs.runner.env))
     for reset, message in [
         ({"seed": [1, 2]}, "a list of 16, got a list of 2"),
-        ({"options": {"size": 3}}, r"expected one of domain, params; got \['size'\]"),
+        ({"options": {"size": 3}}, r"expected domain or params, got \['size'\]"),
         ({"options": {"domain": "nowhere"}}, "unknown shift 'nowhere'"),
+        ({"options": {"domain": "embodiment"}}, "robot=, and the domain 'in_domain'"),
+        ({"options": {"params": blind}}, "camera_fovy: expected 1 to 170 degrees"),
         ({"options": {"params": two}}, r"of 16 .*got camera_fovy of shape \[2\]"),
     ]:
         with pytest.raises(ValueError, match=message):

@@ -27,8 +27,8 @@ def raw_keys(seed: int) -> jax.Array:
 
 
 @functools.cache
-def env(vision: bool = False) -> PlaygroundEnv:
-    return PlaygroundEnv(worlds.runner(TASK).env, spec=worlds.SPEC, vision=vision)
+def env(domain: str = "in_domain", vision: bool = False) -> PlaygroundEnv:
+    return PlaygroundEnv(worlds.runner(TASK).env, domain=domain, spec=worlds.SPEC, vision=vision)
 
 
 def wrapped(**options: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
@@ -44,7 +44,7 @@ def expert(state: Any) -> jax.Array:
 def runner_start(state: Any) -> Any:
     """The plain runner's start from the key that a wrapper gave to the environment."""
     keys = jax.random.wrap_key_data(state.info["rng"])
-    return worlds.runner(TASK).reset(keys, worlds.params(env()._env))
+    return worlds.runner(TASK).reset(keys, state.info["params"])
 
 
 def assert_same_physics(one: Any, other: Any, where: str, rows: Any = slice(None)) -> None:
@@ -172,10 +172,14 @@ def test_a_full_reset_draws_a_new_scene() -> None:
 
 
 @pytest.mark.slow
-def test_images_are_the_runners() -> None:
-    state = physics.jit_physics(jax.vmap(env(vision=True).reset))(raw_keys(5))
+def test_images_are_the_runners_and_every_reset_has_its_scene() -> None:
+    one = env("viewpoint+field_of_view", vision=True)
+    state = physics.jit_physics(jax.vmap(one.reset))(raw_keys(5))
+    params = state.info["params"]
+    assert len(set(np.asarray(params.camera_fovy).tolist())) == worlds.WORLDS
+    np.testing.assert_array_equal(params.camera_angle[0], params.camera_angle[1])
     plain = runner_start(state)
-    seen = worlds.runner(TASK).observe(plain, worlds.params(env()._env), worlds.SPEC)
+    seen = worlds.runner(TASK).observe(plain, params, worlds.SPEC)
     image = np.asarray(state.obs["pixels/view_0"])
     assert image.dtype == np.float32 and image.shape == (worlds.WORLDS, 84, 84, 3)
     off = np.abs(image * 255 - np.asarray(seen.image)).max(-1) > 3
@@ -187,13 +191,19 @@ def test_properties_are_playgrounds() -> None:
     one = env()
     assert isinstance(one, playground.MjxEnv) and one.unwrapped is one
     assert one.action_size == 10 and one.observation_size == {"state": (8,)}
-    assert env(vision=True).observation_size == {"state": (8,), "pixels/view_0": (84, 84, 3)}
+    assert env("viewpoint+field_of_view", vision=True).observation_size == {
+        "state": (8,),
+        "pixels/view_0": (84, 84, 3),
+    }
     assert (one.dt, one.sim_dt, one.n_substeps) == (0.05, 0.005, 10)
     assert one.mj_model.nq == one.mjx_model.nq
     assert one.xml_path.endswith("lift_spam.xml")
     typed = jax.eval_shape(one.reset, jax.random.key(0))
     raw = jax.eval_shape(one.reset, jax.random.PRNGKey(0))
     assert typed.data.qpos.shape == raw.data.qpos.shape == (one.mj_model.nq,)
-    assert make_env(TASK, domain="viewpoint")._params.camera_angle[1] > 0.5
-    with pytest.raises(ValueError, match="unknown shift 'nowhere'"):
-        make_env(TASK, domain="nowhere")
+    for domain, message in [
+        ("nowhere", "unknown shift 'nowhere'"),
+        ("embodiment", "pass its name as robot="),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            make_env(TASK, domain=domain)
