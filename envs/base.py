@@ -6,6 +6,7 @@ All functions are pure, for one world; batch them with `jax.vmap`. Everything th
 leaf of `EnvParams`, so a sweep is a `vmap` over params.
 """
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from typing import Any
@@ -144,6 +145,14 @@ class Env:
 
     def _free_qpos(self, body: str) -> int:
         return int(self.mj_model.jnt_qposadr[self.mj_model.body(body).jntadr[0]])
+
+    def with_model(self, mjx_model: mjx.Model) -> "Env":
+        """This environment with other physics (masses, friction, gains, ...), for domain
+        randomisation; `mjx_model` may be traced. What was read from the model by name, and the
+        arm's kinematics, stay as they are."""
+        other = copy.copy(self)
+        other.mjx_model = mjx_model
+        return other
 
     def default_params(self) -> EnvParams:
         """The training distribution: the paper's front camera, objects within 0.2 x 0.2 m."""
