@@ -51,21 +51,83 @@ def at_object(params: EnvParams, xy: jax.Array) -> EnvParams:
 SHIFTS: dict[str, Callable[..., EnvParams]] = {"workspace": workspace, "viewpoint": viewpoint}
 """Every shift by name."""
 
-DOMAINS: tuple[str, ...] = ("in_domain", "workspace", "viewpoint", "workspace+viewpoint")
-"""The evaluation domains: in-domain, each shift, and their product."""
+
+def lighting(params: EnvParams, *, strength: float = 1.0) -> EnvParams:
+    """Brighter (1) or darker (-1) lights."""
+    return dataclasses.replace(
+        params, light_diffuse=params.light_diffuse * (1 + 0.5 * jnp.asarray(strength))
+    )
+
+
+AXES: dict[str, Callable[..., EnvParams]] = {"lighting": lighting}
+"""Shifts along one axis, strength -1..1."""
+
+EMBODIMENT = "embodiment"
+"""The shift that is no function of `EnvParams`: the same task on another robot, another `Env`."""
+
+DOMAINS: tuple[str, ...] = (
+    "in_domain",
+    "workspace",
+    "viewpoint",
+    "embodiment",
+    "workspace+viewpoint",
+    "workspace+embodiment",
+    "viewpoint+embodiment",
+    "workspace+viewpoint+embodiment",
+)
+"""The evaluation domains: in-domain, and every product of the three shifts."""
+
+
+def strength_range(name: str) -> tuple[float, float]:
+    """Strengths (low, high) that the shift or axis `name` takes."""
+    return (0.0 if name in SHIFTS else -1.0), 1.0
+
+
+def parts(domain: str) -> tuple[str, ...]:
+    """The shifts that a domain is made of; none for `in_domain`.
+
+    Raises:
+      ValueError: an unknown shift, or one that is named twice.
+    """
+    if domain == "in_domain":
+        return ()
+    names = tuple(domain.split("+"))
+    for name in names:
+        if name not in SHIFTS and name not in AXES and name != EMBODIMENT:
+            known = ", ".join(("in_domain", *SHIFTS, *AXES, EMBODIMENT))
+            raise ValueError(f"unknown shift {name!r} in domain {domain!r}; known: {known}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"domain {domain!r} names a shift twice")
+    return names
+
+
+def other_robot(domain: str) -> bool:
+    """Whether a domain is played by another robot than the one of the demonstrations."""
+    return EMBODIMENT in parts(domain)
 
 
 def shifted(params: EnvParams, domain: str, *, strength: float = 1.0) -> EnvParams:
-    """`params` under a domain: `in_domain`, or names of `SHIFTS` joined by `+`.
-
-    Raises:
-      ValueError: an unknown shift; the message lists the known ones.
-    """
-    if domain == "in_domain":
-        return params
-    for name in domain.split("+"):
-        if name not in SHIFTS:
-            known = ", ".join(("in_domain", *SHIFTS))
-            raise ValueError(f"unknown shift {name!r} in domain {domain!r}; known: {known}")
-        params = SHIFTS[name](params, strength=strength)
+    """`params` under a domain, see `parts`; `embodiment` changes nothing here."""
+    for name in parts(domain):
+        if name != EMBODIMENT:
+            params = (SHIFTS | AXES)[name](params, strength=strength)
     return params
+
+
+def scenes(
+    key: jax.Array, params: EnvParams, domain: str, count: int, *, strength: float = 1.0
+) -> EnvParams:
+    """Params of `count` scenes of a domain, leading axis [count]."""
+
+    def one(index: jax.Array) -> EnvParams:
+        here = params
+        for number, name in enumerate(parts(domain)):
+            draw = jax.random.fold_in(jax.random.fold_in(key, index), number)
+            if name in AXES:
+                drawn = strength * jax.random.uniform(draw, (), minval=-1.0, maxval=1.0)
+                here = AXES[name](here, strength=drawn)
+            elif name != EMBODIMENT:
+                here = SHIFTS[name](here, strength=strength)
+        return here
+
+    return jax.vmap(one)(jnp.arange(count))
