@@ -28,19 +28,21 @@ _FUNNEL_ANGLE = 0.06
 # The lift begins slowly: fingers that have yet to close fully do not slide off.
 _LIFT_SPEED = 0.004  # metres of the first control step
 _LIFT_GAIN = 0.3  # metres a step, per metre risen
+_HOLDING_MARGIN = 0.08  # of opening, above the object's width: from there on the lift begins
 _LIFT_MARGIN = 0.03  # the expert heads for a point this far beyond the height that counts as solved
 _FUNNEL_SLOPE = 3.0  # metres of extra height per metre of lateral error
 _FUNNEL_SLOPE_ANGLE = 0.08  # metres of extra height per radian of yaw error
 
 
 class LiftIds(NamedTuple):
-    """Ids in the compiled model that a lift task needs."""
+    """What a lift task needs of the compiled model and the robot."""
 
     body: int
     qpos: int  # address of the free joint in qpos
     grasp_site: int
     grasp_geom: int
     pads: tuple[int, int]
+    holding: float  # opening (0..1) of the gripper below which the fingers have closed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,6 +95,7 @@ class LiftTask(Task):
             grasp_site=model.site(self.grasp_site).id,
             grasp_geom=model.geom(self.grasp_geom).id,
             pads=(left, right),
+            holding=self.grasp_width / robot.max_width + _HOLDING_MARGIN,
         )
 
     def place(self, ids: LiftIds, qpos: jax.Array, xy: jax.Array, yaw: jax.Array) -> Placement:
@@ -135,7 +138,7 @@ class LiftTask(Task):
             & (tcp[2, 3] - grasp[2] < _CLOSE_HEIGHT)
         )
         closing = opening < 0.95
-        holding = closing & (opening < self._holding_opening())
+        holding = closing & (opening < ids.holding)
         bottom = start[2] + (grasp[2] - data.xpos[ids.body, 2])
         speed = _LIFT_SPEED + _LIFT_GAIN * jnp.maximum(tcp[2, 3] - bottom, 0.0)
         lifted = jnp.minimum(
@@ -154,7 +157,3 @@ class LiftTask(Task):
             return jnp.zeros(())
         yaw = jnp.arctan2(rotation[1, 0], rotation[0, 0])
         return jnp.mod(yaw - hand_yaw + jnp.pi / 2, jnp.pi) - jnp.pi / 2
-
-    def _holding_opening(self) -> float:
-        # The Panda's 0.08 m at full opening; other grippers stall at the same width.
-        return self.grasp_width / 0.08 + 0.08
