@@ -13,6 +13,7 @@ Wilson 95 % interval.
 import functools
 import io
 import math
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec
@@ -355,8 +356,8 @@ def strength_curves(
     panels = {shift: curves for shift, curves in panels.items() if curves}
     if not panels:
         return _empty("no strengths to draw")
-    columns = min(columns, len(panels))
     rows = math.ceil(len(panels) / columns)
+    columns = math.ceil(len(panels) / rows)
     width = 4.4 if len(panels) == 1 else 3.4
     figure = Figure(
         figsize=(columns * width + 0.3, 2.6 * rows + 0.5 + 0.3 * bool(title)), layout="constrained"
@@ -372,6 +373,8 @@ def strength_curves(
         axes.set_xlim(every.min() - room, every.max() + room)
         axes.set_title(paper.domain_title(shift))
         axes.set_xlabel("strength   (dashed: none)")
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=5, steps=[1, 2, 5, 10]))
+        axes.xaxis.set_major_formatter("{x:g}")
         if index % columns:
             axes.set_ylabel("")
         methods |= curves
@@ -644,7 +647,7 @@ def domain_bars(
         for border in np.arange(len(shown) - 1) + 0.5:
             axes.axvline(border, color=FAINT, linewidth=0.8)
         axes.set_xlim(-0.5, columns - 0.5)
-        axes.set_xticks(range(len(shown)), [paper.domain_label(name) for name in shown])
+        axes.set_xticks(range(len(shown)), [_domain_name(name) for name in shown])
         axes.tick_params(axis="x", length=0, labelsize=9, labelcolor=INK)
         _percent_axis(axes)
     handles: list[Any] = [
@@ -868,12 +871,19 @@ def gallery(
                 axes.set_facecolor("#f1f3f5")
                 axes.set_aspect("equal")
             if i == 0:
-                axes.set_title(paper.domain_label(domain), loc="center", pad=4)
+                axes.set_title(_domain_name(domain), loc="center", pad=4)
             if j == 0:
-                axes.set_ylabel(_wrapped(name), fontsize=8.5, fontweight="bold", color=INK)
+                words = _wrapped(name)
+                size = 8.5 if max(map(len, words.split("\n"))) <= 15 else 7.0
+                axes.set_ylabel(words, fontsize=size, fontweight="bold", color=INK)
     if title:
         figure.suptitle(title + "\n", x=0.01, ha="left", fontweight="bold", fontsize=11)
     return figure
+
+
+def _domain_name(domain: str) -> str:
+    """A domain's short label; one that is long in lines that fit into a column."""
+    return textwrap.fill(paper.domain_label(domain), 12, break_long_words=False)
 
 
 def _wrapped(name: str) -> str:
