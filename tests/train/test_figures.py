@@ -190,6 +190,13 @@ def test_bars_intervals_and_the_papers_marks() -> None:
     assert [label.get_text() for label in axes.get_xticklabels()] == ["ID", "W+V"]
 
 
+def test_long_domain_names_are_broken_into_lines() -> None:
+    entry = {"successes": 1, "episodes": 2}
+    counts = {"palm": {"in_domain": entry, "object_color+viewpoint": entry}}
+    labels = [t.get_text() for t in figures.domain_bars(counts).axes[0].get_xticklabels()]
+    assert labels == ["ID", "object color\n+ viewpoint"]
+
+
 def test_many_methods_break_the_bars_into_two_rows() -> None:
     entry = {"successes": 1, "episodes": 2}
     counts = {f"m{i}": {d: entry for d in ("ID", "W", "V", "E", "WVE")} for i in range(5)}
