@@ -77,6 +77,7 @@ def execute(config: Config, console: Console) -> Path:
     Raises:
       ConfigError: the folder holds another run.
       DemoFileError: the demonstrations cannot be used.
+      StartPoseError: a domain asks for start poses that an arm cannot take.
       Interrupted: stopped on request.
     """
     start = time.monotonic()
@@ -98,13 +99,17 @@ def execute(config: Config, console: Console) -> Path:
         },
     )
     runners = Runners.of(config.task, config.robot, config.second_robot, _worlds(config))
+    # One for each method throughout: what it has compiled, it keeps.
+    evaluators = {
+        name: workspace.make_evaluator(config, methods.find(name), runners) for name in folders
+    }
     data = _demonstrations(config, runners.first, console)
     for name, folder in folders.items():
         began = time.monotonic()
-        _one_method(config, methods.find(name), runners, data, folder, console)
+        _one_method(config, evaluators[name], data, folder, console)
         _note_environment(config, folder, time.monotonic() - began)
     if config.sweep:
-        _sweeps(config, runners, folders, console)
+        _sweeps(evaluators, folders, console)
     _gallery(folders, out)
     report.write_report(out)
     counts = {name: records.load_counts(folder / "eval.json") for name, folder in folders.items()}
@@ -163,16 +168,15 @@ def _demonstrations(config: Config, runner: Runner, console: Console) -> demos.D
 
 def _one_method(
     config: Config,
-    method: methods.Method,
-    runners: Runners,
+    evaluator: Evaluator,
     data: demos.Demos,
     folder: Path,
     console: Console,
 ) -> None:
+    method = evaluator.method
     if (folder / "eval.json").exists():
         console.print(f"{method.name}: trained and evaluated already")
         return
-    evaluator = workspace.make_evaluator(config, method, runners)
     spec, runner = method.spec(evaluator.task, config.image_size), evaluator.runner
     images, proprio, cameras = demos.render_observations(runner, data, spec, frame=method.frame)
     batch = learner.Batch(
@@ -345,7 +349,7 @@ def _film_domain(
             videos.write_video(folder / "videos" / name, frames)
 
 
-def _sweeps(config: Config, runners: Runners, folders: dict[str, Path], console: Console) -> None:
+def _sweeps(evaluators: dict[str, Evaluator], folders: dict[str, Path], console: Console) -> None:
     """A coarse sweep of every policy; `python -m palm_jax sweep RUN` makes finer ones."""
     options = sweep.SweepConfig(run=Path())
     job = sweep.job(options)
@@ -353,7 +357,7 @@ def _sweeps(config: Config, runners: Runners, folders: dict[str, Path], console:
         path = records.sweep_path(folder)
         if path.exists():
             continue
-        evaluator = workspace.make_evaluator(config, methods.find(name), runners)
+        evaluator = evaluators[name]
         with terminal.ProgressBar(console, job.episodes, f"sweep {name}", unit="episode") as bar:
             found = job.run(
                 evaluator,
