@@ -113,7 +113,7 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
 
 
 def check_params(params: EnvParams) -> None:
-    """Raises where `params` contradict themselves; on the host, in well under a millisecond.
+    """Raises where `params` contradict themselves; on the host, a millisecond or two a batch.
 
     Args:
       params: of one world, or with leading axes that all fields share. Traced params pass: inside

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from palm_jax.envs.distractors import Distractors, task_geoms
+from palm_jax.envs.distractors import task_geoms
 from palm_jax.envs.params import EnvParams
+from palm_jax.envs.world import DISTRACTORS
 from palm_jax.render import Scene, make_lights, make_scene
 
 _TEXTURES = {"table_top": ("wood", 0.09), "floor": ("checker", 0.35)}
@@ -54,7 +55,8 @@ class SceneModel:
         self.rgb = model.geom_rgba[self.geoms, :3].astype(np.float32)
         self.robot = _below(model, model.body("robot_base").id)[model.geom_bodyid[self.geoms]]
         self.objects = task_geoms(model)[self.geoms]
-        self._distractors = np.isin(model.geom_bodyid[self.geoms], Distractors(model).bodies)
+        distractors = [model.body(name).id for name in DISTRACTORS]
+        self._distractors = np.isin(model.geom_bodyid[self.geoms], distractors)
         self._table = names.index("table_top")
         self.table = TableDefaults(
             self.rgb[self._table], _SECOND * self.rgb[self._table], _TEXTURES["table_top"][1]

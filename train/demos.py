@@ -28,7 +28,8 @@ from palm_jax.envs.expert import Demonstrator, Recording
 from palm_jax.envs.rollout import Runner, repeat_params, take_params
 
 FORMAT = "palm_jax-demos"
-VERSION = 2  # 1 had neither stages nor the poses of the table's distractors
+VERSION = 2
+"""2: frames have a stage, mocap poses begin with the distractors', and `env_params` has all that can shift now."""
 
 
 class DemoFileError(ValueError):
@@ -212,8 +213,8 @@ def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None
         found = data.attrs.get(name)
         found = found.item() if isinstance(found, np.generic) else found  # readable in a message
         if found != value:
-            hint = ": collect again" if name == "version" else ""
-            raise DemoFileError(f"{path}: expected {name} {value!r}, found {found!r}{hint}")
+            advice = "; move it away and collect again" if name == "version" else ""
+            raise DemoFileError(f"{path}: expected {name} {value!r}, found {found!r}{advice}")
     demos = [data[f"demo_{i}"] for i in range(len(data))]
     if count is not None:
         if len(demos) < count:

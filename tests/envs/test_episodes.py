@@ -72,7 +72,7 @@ def test_the_hand_goes_where_it_is_told() -> None:
     default = dataclasses.replace(
         shifts.shifted(runner.env.default_params(), "workspace+viewpoint"),
         start_radius=jnp.zeros(()),
-        start_height=jnp.array([0.17, 0.17]),
+        start_height=jnp.array([[0.17, 0.17]]),
         start_yaw=jnp.array([0.2, 0.2]),
     )
     for align_hand in (0.0, 1.0):
@@ -100,8 +100,8 @@ def test_start_poses_out_of_reach_are_drawn_again() -> None:
 
 def test_a_region_out_of_reach_is_an_error_that_names_the_params() -> None:
     runner = worlds.runner("lift_spam")
-    # In view of the camera, a metre from the robot.
-    far = shifts.at_object(runner.env.default_params(), jnp.array([0.72, 0.0]))
+    # On the table and in view of the camera, a metre from the robot.
+    far = shifts.at_object(runner.env.default_params(), jnp.array([0.69, 0.25]))
     some = jax.tree.map(
         lambda near, away: jnp.stack([near] * (worlds.WORLDS - 2) + [away] * 2),
         runner.env.default_params(),
