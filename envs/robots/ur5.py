@@ -15,7 +15,7 @@ UR5 = Robot(
         "wrist_2_joint",
         "wrist_3_joint",
     ),
-    velocity_limits=(math.pi,) * 6,
+    velocity_limits=(math.pi,) * 6,  # 180 degrees a second
     gripper_joints=("left_finger", "right_finger"),
     gripper_closed=(0.0, 0.0),
     gripper_open=(0.0425, 0.0425),

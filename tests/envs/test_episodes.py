@@ -19,6 +19,7 @@ LOCATED = {"lift_spam": 0.016, "lift_lid": 0.010}
 camera."""
 
 tasks = pytest.mark.parametrize("task", worlds.TASKS)
+cases = pytest.mark.parametrize(("task", "robot"), worlds.CASES)
 
 
 @functools.cache
@@ -122,10 +123,10 @@ def test_scenes_depend_on_their_own_key_alone() -> None:
     assert len(np.unique(np.asarray(one.object_start), axis=0)) == worlds.WORLDS
 
 
-@tasks
-def test_the_expert_solves_the_task(task: str) -> None:
+@cases
+def test_the_expert_solves_the_task(task: str, robot: str) -> None:
     """At least 95 % of 48 scenes over the whole test region, without noise."""
-    episodes = worlds.expert_episodes(task)
+    episodes = worlds.expert_episodes(task, robot)
     solved = np.concatenate([states.success[-1] for states in episodes])
     assert solved.mean() >= 0.95, f"{solved.sum()} of {len(solved)}"
     for states in episodes:
@@ -134,11 +135,11 @@ def test_the_expert_solves_the_task(task: str) -> None:
             assert np.isfinite(leaf).all()
 
 
-@tasks
-def test_a_held_object_does_not_slip(task: str) -> None:
+@cases
+def test_a_held_object_does_not_slip(task: str, robot: str) -> None:
     """Less than 1 cm in the hand, from the moment it leaves its support to the end."""
-    env = worlds.runner(task).env
-    for states in worlds.expert_episodes(task):
+    env = worlds.runner(task, robot).env
+    for states in worlds.expert_episodes(task, robot):
         tcp, body = worlds.tcp(env, states), states.data.xpos[:, :, env._ids.body]
         inside = np.einsum("twji,twj->twi", tcp[..., :3, :3], body - tcp[..., :3, 3])
         risen = body[..., 2] - states.object_start[..., 2] > 0.005
@@ -147,12 +148,12 @@ def test_a_held_object_does_not_slip(task: str) -> None:
             assert np.linalg.norm(held - held[0], axis=-1).max() < 0.01
 
 
-@tasks
-def test_nothing_passes_through_anything(task: str) -> None:
+@cases
+def test_nothing_passes_through_anything(task: str, robot: str) -> None:
     """Supports carry their object within half a millimetre, fingers press into it by under 3 mm."""
-    env = worlds.runner(task).env
+    env = worlds.runner(task, robot).env
     fingers = set(env.robot.pads) | set(env.robot.tips)
-    for states in worlds.expert_episodes(task):
+    for states in worlds.expert_episodes(task, robot):
         solved = states.success[-1]  # where it failed, the object may have been knocked over
         for pair, distance in worlds.gaps(env, states).items():
             distance = distance[:, solved]
