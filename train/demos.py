@@ -29,7 +29,8 @@ from palm_jax.envs.rollout import Runner, repeat_params, take_params
 
 FORMAT = "palm_jax-demos"
 VERSION = 2
-"""2: frames have a stage, mocap poses begin with the distractors', and `env_params` has all that can shift now."""
+"""2: frames have a stage, mocap poses begin with the distractors', and `env_params` has all that
+can shift now."""
 
 
 class DemoFileError(ValueError):
