@@ -1,4 +1,4 @@
-"""An evaluation as the training command does it: 4 domains x 50 scenes, after compilation.
+"""An evaluation as the training command does it: 8 domains x 50 scenes, after compilation.
 
 The policy is an untrained width-16 network, so that every episode takes its whole horizon: the
 worst case. Each piece is waited for, which costs little and tells where the time goes.
@@ -13,8 +13,10 @@ import jax
 import jax.numpy as jnp
 
 from palm_jax.envs import make, shifts
+from palm_jax.envs.registry import TASKS
 from palm_jax.envs.rollout import Act, Runner
-from palm_jax.train.evaluate import Evaluator
+from palm_jax.train.config import Config
+from palm_jax.train.evaluate import Evaluator, Runners
 from palm_jax.train.learner import LearnerConfig, Normalizer, PolicyState, Range, make_learner
 from palm_jax.train.methods import find
 
@@ -36,8 +38,8 @@ def timed(clock: Clock, name: str, function: Callable[..., Any]) -> Callable[...
 class TimedRunner(Runner):
     """A runner that notes where time goes."""
 
-    def __init__(self, task: str, worlds: int, clock: Clock) -> None:
-        super().__init__(make(task), worlds)
+    def __init__(self, task: str, robot: str, worlds: int, clock: Clock) -> None:
+        super().__init__(make(task, robot), worlds)
         self.step = timed(clock, "physics", self.step)
         self.reset = timed(clock, "reset", self.reset)  # type: ignore[method-assign]
         self.observe = timed(clock, "render", self.observe)  # type: ignore[method-assign]
@@ -56,21 +58,25 @@ class TimedEvaluator(Evaluator):
 def run(*, task: str = "lift_spam", scenes: int = 50, horizon: int | None = None) -> dict[str, Any]:
     """Seconds of the whole evaluation, and of its parts."""
     clock: Clock = {}
-    runner, method = TimedRunner(task, scenes, clock), find("palm")
-    size = method.spec(runner.env.task, 84).proprio_size
+    config, method = Config(task=task), find("palm")
+    runners = Runners(
+        lambda robot: TimedRunner(task, robot, scenes, clock), config.robot, config.second_robot
+    )
+    size = method.spec(TASKS[task], 84).proprio_size
     learner = make_learner(LearnerConfig(width=16), size)
     ranges = [Range(jnp.full(n, -0.01), jnp.full(n, 0.01)) for n in (size, 10)]
     state = jax.jit(learner.init)(jax.random.key(0), Normalizer(*ranges))
     policy = learner.policy_state(state)
-    evaluator = TimedEvaluator(runner, method, learner, 84, clock)
-    whole = runner.env.task
+    evaluator = TimedEvaluator(runners, method, learner, 84, clock)
+    whole = TASKS[task]
 
     def evaluate(steps: int) -> int:
-        runner.env.task = dataclasses.replace(whole, horizon=steps)
-        return sum(
-            int(evaluator.domain(policy, d, seed=0, count=scenes, aligned=True).length.sum())
-            for d in shifts.DOMAINS
-        )
+        total = 0
+        for domain in shifts.DOMAINS:
+            runners.domain(domain).env.task = dataclasses.replace(whole, horizon=steps)
+            record = evaluator.domain(policy, domain, seed=0, count=scenes, aligned=True)
+            total += int(record.length.sum())
+        return total
 
     start = time.perf_counter()
     evaluate(1)
@@ -87,6 +93,7 @@ def run(*, task: str = "lift_spam", scenes: int = 50, horizon: int | None = None
         "task": task,
         "scenes": scenes,
         "domains": list(shifts.DOMAINS),
+        "robots": [runners.robot, runners.other],
         "horizon": horizon or whole.horizon,
         "width": learner.config.width,
     }

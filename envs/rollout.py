@@ -6,14 +6,15 @@ jits, each with the compiler options it wants: the fast way on CPUs. `scan_episo
 episodes up to rounding.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Hashable
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from palm_jax.align import Aligned, AlignSpec
+from palm_jax.align import Aligned, AlignSpec, Camera
 from palm_jax.envs import physics
 from palm_jax.envs.base import WIDE_FRAME, Env, EnvParams, State
 from palm_jax.envs.params import ParamsError as ParamsError
@@ -35,6 +36,7 @@ class Episodes(NamedTuple):
     object_xy: jax.Array  # [N, 2] where the target started, metres
     object_yaw: jax.Array  # radians
     camera_angle: jax.Array  # radians
+    draws: jax.Array  # int32: start poses drawn until one was in the arm's reach
 
 
 def _outcome(state: State, length: jax.Array) -> Episodes:
@@ -46,6 +48,7 @@ def _outcome(state: State, length: jax.Array) -> Episodes:
         object_xy=state.object_start[..., :2],
         object_yaw=state.object_yaw,
         camera_angle=state.camera_angle,
+        draws=state.draws,
     )
 
 
@@ -102,6 +105,12 @@ def step_worlds(env: Env, state: State, action: jax.Array, params: EnvParams) ->
     return jax.lax.cond(jnp.any(state.jump), jump, lambda state: state, state)
 
 
+def _full_frame(env: Env, state: State, params: EnvParams, *, size: int) -> jax.Array:
+    rgb = env.render(state, params, size).rgb
+    assert rgb is not None
+    return rgb
+
+
 class Runner:
     """The compiled pieces of an environment for a fixed number of worlds.
 
@@ -124,7 +133,7 @@ class Runner:
         self._locate = jax.jit(jax.vmap(env.locate))
         self.restore = physics.jit_physics(jax.vmap(env.restore))
         self._reposition = physics.jit_physics(jax.vmap(env.reposition))
-        self._observers: dict[tuple[AlignSpec, int], Callable[..., Aligned]] = {}
+        self._views: dict[Hashable, Callable[..., Any]] = {}
 
     def reset(self, keys: jax.Array, params: EnvParams) -> State:
         """`Env.reset` of W worlds, in three compiled pieces.
@@ -157,13 +166,26 @@ class Runner:
         self, state: State, params: EnvParams, spec: AlignSpec, *, frame: int = WIDE_FRAME
     ) -> Aligned:
         """`Env.observe` of W worlds; compiled once for each `spec` and `frame`."""
-        if (spec, frame) not in self._observers:
+        view = partial(self.env.observe, spec=spec, frame=frame)
+        return self._view(("observe", spec, frame), view)(state, params)
 
-            def observe(state: State, params: EnvParams) -> Aligned:
-                return self.env.observe(state, params, spec, frame=frame)
+    def window_camera(
+        self, state: State, params: EnvParams, spec: AlignSpec, *, frame: int = WIDE_FRAME
+    ) -> Camera:
+        """`Env.window_camera` of W worlds; compiled once for each `spec` and `frame`."""
+        view = partial(self.env.window_camera, spec=spec, frame=frame)
+        return self._view(("window_camera", spec, frame), view)(state, params)
 
-            self._observers[spec, frame] = jax.jit(jax.vmap(observe))
-        return self._observers[spec, frame](state, params)
+    def render(self, state: State, params: EnvParams, size: int) -> jax.Array:
+        """The paper's full frame, uint8 [W, size, size, 3]; compiled once for each `size`."""
+        view = partial(_full_frame, self.env, size=size)
+        return self._view(("render", size), view)(state, params)
+
+    def _view(self, name: Hashable, function: Callable[..., Any]) -> Callable[..., Any]:
+        """`function` (state, params) of W worlds; whatever has the same name is compiled once."""
+        if name not in self._views:
+            self._views[name] = jax.jit(jax.vmap(function))
+        return self._views[name]
 
     def run(
         self,

@@ -14,6 +14,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("palm_jax: loading JAX and MuJoCo ...", flush=True)
     warnings.filterwarnings("ignore", message=".*donated buffers were not usable.*")
     with without_lines():  # MJX's complaints about the missing warp back end
+        from palm_jax.envs.rollout import StartPoseError
         from palm_jax.train import config as configuration
         from palm_jax.train import console as terminal
         from palm_jax.train import run
@@ -27,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     try:
         run.execute(config, console)
-    except (configuration.ConfigError, DemoFileError) as error:
+    except (configuration.ConfigError, DemoFileError, StartPoseError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

@@ -9,7 +9,7 @@ from pathlib import Path
 import tyro
 
 from palm_jax.envs.registry import ROBOTS, TASKS
-from palm_jax.envs.shifts import DOMAINS
+from palm_jax.envs.shifts import AXES, DOMAINS, EMBODIMENT, SHIFTS, parts
 from palm_jax.train import methods
 from palm_jax.train.learner import LearnerConfig
 
@@ -29,7 +29,8 @@ class Config:
       seed: of training. Demonstrations and evaluation scenes have seeds of their own.
       out: the run folder; by default runs/PRESET-TASK-METHODS-sSEED.
       resume: go on with the run in `out`.
-      robot: which arm.
+      robot: which arm demonstrates.
+      other_robot: the arm of `embodiment` domains; by default the first other one there is.
       data: demonstrations to use (made if the file does not exist); by default inside `out`.
       demos: number of demonstrations.
       demo_seed: of the demonstrations.
@@ -56,7 +57,7 @@ class Config:
       keep: checkpoints kept, by score.
       scenes: evaluation scenes in each domain.
       eval_seed: of the evaluation scenes.
-      domains: evaluation domains.
+      domains: evaluation domains: in_domain, and shifts joined by +.
       videos: episodes filmed for each outcome (success, failure) and method.
       sweep: draw the success heatmaps and camera-angle curves after training.
     """
@@ -68,6 +69,7 @@ class Config:
     out: Path | None = None
     resume: bool = False
     robot: str = "panda"
+    other_robot: str = ""
     data: Path | None = None
     demos: int = 100
     demo_seed: int = 0
@@ -97,6 +99,11 @@ class Config:
     videos: int = 1
     sweep: bool = True
 
+    @property
+    def second_robot(self) -> str:
+        """The robot of `embodiment` domains, `other_robot` resolved."""
+        return self.other_robot or next(name for name in ROBOTS if name != self.robot)
+
     def learner(self, method: methods.Method) -> LearnerConfig:
         """The learner's configuration for a method: the same for all, but for augmentation."""
         return LearnerConfig(
@@ -125,9 +132,14 @@ class Config:
         _known("task", [self.task], TASKS)
         _known("robot", [self.robot], ROBOTS)
         _known("method", self.method, methods.METHODS)
-        _known("domain", self.domains, DOMAINS)
-        if "in_domain" not in self.domains:
-            raise ConfigError("domains must contain in_domain: degradation is relative to it")
+        if self.other_robot:
+            _known("robot", [self.other_robot], ROBOTS)
+        if self.other_robot == self.robot:
+            raise ConfigError(
+                f"other_robot: expected another robot than robot = {self.robot!r}, e.g. "
+                f"{dataclasses.replace(self, other_robot='').second_robot!r}"
+            )
+        _check_domains(self.domains)
         for name in ("demos", "scenes", "select_scenes", "steps", "checkpoint_every", "keep"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name}: expected at least 1, got {getattr(self, name)}")
@@ -145,6 +157,22 @@ class Config:
                 self.learner(methods.find(method))
         except ValueError as error:
             raise ConfigError(str(error)) from error
+
+
+def _check_domains(domains: Sequence[str]) -> None:
+    """Raises ConfigError for what is no domain, for one given twice, and without in_domain."""
+    given: dict[frozenset[str], str] = {}
+    for domain in domains:
+        _known("domain", domain.split("+"), ("in_domain", *SHIFTS, *AXES, EMBODIMENT))
+        try:
+            shifts = frozenset(parts(domain))
+        except ValueError as error:
+            raise ConfigError(f"domains: {error}") from error
+        if shifts in given:
+            raise ConfigError(f"domains: {given[shifts]} and {domain} are the same: give one")
+        given[shifts] = domain
+    if "in_domain" not in domains:
+        raise ConfigError("domains must contain in_domain: degradation is relative to it")
 
 
 def _known(what: str, names: Iterable[str], known: Collection[str]) -> None:

@@ -1,10 +1,13 @@
 """Demonstrations: a robomimic-style HDF5 file of states, and the images rendered from it on demand.
 
-Layout: `data/demo_i/{states, actions, obs/{tcp, opening, qpos, qvel}, env_params/*}`. `states`
-rows are time, qpos, qvel as in robomimic; a demo's attributes hold `num_samples`, `model_file`
-(MJCF), `camera_info` (JSON: intrinsics and camera-to-world extrinsics of the 512-pixel front
-image, OpenCV axes), its seed and the mocap poses. `data` has `total`, `env_args` (JSON) and the
-provenance. No pixels: they depend on the method.
+Layout: `data/demo_i/{states, actions, obs/{tcp, opening, qpos, qvel, stage}, env_params/*}`.
+`states` rows are time, qpos, qvel as in robomimic; a demo's attributes hold `num_samples`,
+`model_file` (MJCF), `camera_info` (JSON: intrinsics and camera-to-world extrinsics of the 512-pixel
+front image, OpenCV axes), its seed and the mocap poses. `data` has `total`, `env_args` (JSON) and
+the provenance. No pixels: they depend on the method.
+
+Where `stage` changes from one row to the next the global policy has moved the hand in between.
+Actions are what was commanded, so that jump is in none of them.
 """
 
 import dataclasses
@@ -26,7 +29,8 @@ from palm_jax.envs.rollout import Runner, repeat_params, take_params
 
 FORMAT = "palm_jax-demos"
 VERSION = 2
-"""2: mocap poses begin with the distractors', and `env_params` has all that can shift now."""
+"""2: frames have a stage, mocap poses begin with the distractors', and `env_params` has all that
+can shift now."""
 
 
 class DemoFileError(ValueError):
@@ -42,6 +46,7 @@ class Demos:
     opening: np.ndarray  # [N]
     actions: np.ndarray  # [N, 10]
     episode: np.ndarray  # [N] index of the frame's episode
+    stages: np.ndarray  # [N] stage of the task; between two of them the hand is repositioned
     mocap_pos: np.ndarray  # [E, nmocap, 3]
     mocap_quat: np.ndarray  # [E, nmocap, 4]
     camera_to_world: np.ndarray  # [E, 4, 4]
@@ -133,6 +138,7 @@ def _write_demo(
     demo["rewards"] = frames.success.astype(np.float32)
     for name in ("tcp", "opening", "qpos", "qvel"):
         demo[f"obs/{name}"] = getattr(frames, name).astype(np.float32)
+    demo["obs/stage"] = frames.stage.astype(np.int32)
     for field in dataclasses.fields(EnvParams):
         demo[f"env_params/{field.name}"] = np.asarray(getattr(params, field.name)[world])
     focal = PAPER_FRAME / 2 / np.tan(np.radians(float(params.camera_fovy[world])) / 2)
@@ -225,6 +231,7 @@ def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None
         "tcp": np.concatenate([demo["obs/tcp"][()] for demo in demos]),
         "opening": np.concatenate([demo["obs/opening"][()] for demo in demos]),
         "actions": np.concatenate([demo["actions"][()] for demo in demos]),
+        "stages": np.concatenate([demo["obs/stage"][()] for demo in demos]),
     }
     for name, array in arrays.items():
         if len(array) != sum(lengths) or not np.isfinite(array).all():
@@ -256,9 +263,6 @@ def render_observations(
     """
     total, worlds = len(demos.qpos), runner.worlds
     images, proprio, cameras = [], [], []
-    camera_of = jax.jit(
-        jax.vmap(lambda state, params: runner.env.window_camera(state, params, spec, frame=frame))
-    )
     for first in range(0, total, worlds):
         rows = np.minimum(np.arange(first, first + worlds), total - 1)
         episode = demos.episode[rows]
@@ -273,7 +277,7 @@ def render_observations(
         seen = runner.observe(state, params, spec, frame=frame)
         images.append(np.asarray(seen.image))
         proprio.append(np.asarray(seen.proprio))
-        cameras.append(camera_of(state, params))
+        cameras.append(runner.window_camera(state, params, spec, frame=frame))
     camera = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:total], *cameras)
     return np.concatenate(images)[:total], np.concatenate(proprio)[:total], camera
 

@@ -1,15 +1,16 @@
 """Success of a policy in every domain: all scenes of a domain in one vmapped rollout."""
 
 import dataclasses
+import functools
 import zlib
 from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
 
-from palm_jax.envs import shifts
+from palm_jax.envs import registry, shifts
 from palm_jax.envs.base import EnvParams, State
-from palm_jax.envs.rollout import Act, Episodes, Runner, repeat_params, take_params
+from palm_jax.envs.rollout import Act, Episodes, Runner, take_params
 from palm_jax.envs.tasks import Task
 from palm_jax.train.learner import Learner, PolicyState
 from palm_jax.train.methods import Method
@@ -21,14 +22,46 @@ VIEW = "front"
 """Name of the one camera view that policies see so far."""
 
 
+class Runners:
+    """One task on two robots: the one of the demonstrations, and that of `embodiment` domains.
+
+    A robot's `Runner` is made when it is first asked for, which takes most of a minute to compile,
+    and kept: methods share it.
+    """
+
+    def __init__(self, make: Callable[[str], Runner], robot: str, other: str) -> None:
+        """`make` gives a robot's runner; all have the same task and number of worlds."""
+        self.robot, self.other = robot, other
+        self._make = functools.cache(make)
+
+    @classmethod
+    def of(cls, task: str, robot: str, other: str, worlds: int) -> "Runners":
+        """The runners of a task and two robots by name, `worlds` worlds a batch."""
+        return cls(lambda name: Runner(registry.make(task, name), worlds), robot, other)
+
+    @property
+    def first(self) -> Runner:
+        """That of the robot that the demonstrations are of."""
+        return self._make(self.robot)
+
+    def domain(self, domain: str) -> Runner:
+        """The one that plays a domain."""
+        return self._make(self.other if shifts.other_robot(domain) else self.robot)
+
+
 @dataclasses.dataclass(frozen=True)
 class Evaluator:
-    """What stays the same over the evaluations of one method: world, input, learner."""
+    """What stays the same over the evaluations of one method: worlds, input, learner."""
 
-    runner: Runner
+    runners: Runners
     method: Method
     learner: Learner
     image_size: int
+
+    @property
+    def runner(self) -> Runner:
+        """The world of the robot that the demonstrations are of."""
+        return self.runners.first
 
     @property
     def task(self) -> Task:
@@ -46,6 +79,7 @@ class Evaluator:
         params: EnvParams,
         count: int,
         *,
+        runner: Runner | None = None,
         watch: Watch | None = None,
     ) -> Episodes:
         """`count` episodes; scene i depends on (`scenes`, i) and its params alone.
@@ -55,9 +89,11 @@ class Evaluator:
           scenes: key of the scenes.
           params: leading axis [count].
           count: any number; batches of the runner's size, the last one filled up and cut.
+          runner: the world; by default `self.runner`.
           watch: shown every state of the first batch.
         """
-        spec, worlds = self.method.spec(self.task, self.image_size), self.runner.worlds
+        runner = runner or self.runner
+        spec, worlds = self.method.spec(self.task, self.image_size), runner.worlds
         parts = []
         for first in range(0, count, worlds):
             rows = np.arange(first, first + worlds)
@@ -65,7 +101,7 @@ class Evaluator:
             batch = take_params(params, np.minimum(rows, count - 1))
             noise = jax.random.fold_in(scenes, 2**31 + first)
             parts.append(
-                self.runner.run(
+                runner.run(
                     noise,
                     keys,
                     batch,
@@ -88,13 +124,20 @@ class Evaluator:
         watch: Watch | None = None,
     ) -> DomainRecord:
         """`count` scenes of a domain; the same scenes for every method and policy."""
-        params = shifts.shifted(self.runner.env.default_params(), domain)
-        if aligned:
-            params = shifts.aligned_hand(params)
-        episodes = self.episodes(
-            policy, scene_key(seed, domain), repeat_params(params, count), count, watch=watch
-        )
-        return record(episodes)
+        params = self.scenes(domain, seed=seed, count=count, aligned=aligned)
+        scenes, runner = scene_key(seed, domain), self.runners.domain(domain)
+        return record(self.episodes(policy, scenes, params, count, runner=runner, watch=watch))
+
+    def scenes(self, domain: str, *, seed: int, count: int, aligned: bool) -> EnvParams:
+        """Params of a domain's scenes, leading axis [count]; with the robot that plays it.
+
+        `aligned`: whether the hand's initial yaw turns with the camera.
+        """
+        # Apart from the keys of the scenes and of the policy in `episodes`.
+        key = jax.random.fold_in(scene_key(seed, domain), 2**32 - 1)
+        params = self.runners.domain(domain).env.default_params()
+        params = shifts.scenes(key, params, domain, count)
+        return shifts.aligned_hand(params) if aligned else params
 
 
 def scene_key(seed: int, domain: str) -> jax.Array:
@@ -110,6 +153,7 @@ def record(episodes: Episodes) -> DomainRecord:
         object_xy=np.asarray(episodes.object_xy),
         camera_angle=np.asarray(episodes.camera_angle),
         length=np.asarray(episodes.length),
+        draws=np.asarray(episodes.draws),
     )
 
 
@@ -128,7 +172,7 @@ def evaluate(
     Args:
       evaluator: see there.
       policy: from `Learner.policy_state`.
-      domains: names, see `shifts.shifted`.
+      domains: names, see `shifts.parts`.
       seed, scenes: of the scenes in each domain.
       progress: called after each domain.
       watch: (variant, domain) -> what is to be shown the states of its first batch, if anything.
@@ -140,8 +184,7 @@ def evaluate(
     variants = ("aligned",) if evaluator.method.hand == "aligned" else ("unaligned", "aligned")
     results: dict[str, dict[str, DomainRecord]] = {variant: {} for variant in variants}
     for domain in domains:
-        turned = "viewpoint" in domain
-        for variant in variants if turned else variants[:1]:
+        for variant in variants if turned(domain) else variants[:1]:
             results[variant][domain] = evaluator.domain(
                 policy,
                 domain,
@@ -150,12 +193,17 @@ def evaluate(
                 aligned=variant == "aligned",
                 watch=watch(variant, domain) if watch else None,
             )
-        if not turned:
+        if not turned(domain):
             for variant in variants[1:]:
                 results[variant][domain] = results[variants[0]][domain]
         if progress:
             progress()
     return results
+
+
+def turned(domain: str) -> bool:
+    """Whether the camera turns in a domain: there the hand's initial yaw may turn with it."""
+    return any(name.startswith("viewpoint") for name in shifts.parts(domain))
 
 
 def quoted(results: dict[str, dict[str, DomainRecord]]) -> str:

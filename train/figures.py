@@ -13,6 +13,7 @@ Wilson 95 % interval.
 import functools
 import io
 import math
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec
@@ -316,7 +317,7 @@ def angle_curves(curves: Mapping[str, Curve], regions: Regions, *, title: str = 
     figure = Figure(figsize=(6.2, 3.3), layout="constrained")
     axes = figure.subplots()
     limit = math.degrees(regions.test_angle)
-    every = np.concatenate([np.degrees(curve.angles) for curve in curves.values()])
+    every = np.concatenate([np.degrees(curve.at) for curve in curves.values()])
     reach = max(limit, float(np.abs(every).max())) * 1.08
     axes.axvspan(-limit, limit, color="#f4f6f8", zorder=0, linewidth=0)
     axes.axvline(math.degrees(regions.train_angle), color=MUTED, linewidth=1, dashes=(4, 2))
@@ -330,26 +331,86 @@ def angle_curves(curves: Mapping[str, Curve], regions: Regions, *, title: str = 
         fontsize=7.5,
         va="bottom",
     )
+    _curve_lines(axes, curves, np.degrees, spread=0.9)
+    axes.set_xlim(-reach, reach)
+    ticks = np.arange(-math.floor(reach / 10) * 10, reach, 10)
+    axes.set_xticks(ticks, [_degrees(tick) for tick in ticks])
+    axes.set_xlabel("camera angle about the workspace centre   (shaded: test range)")
+    _curve_legend(figure, curves)
+    if title:
+        axes.set_title(title, pad=14)
+    return figure
+
+
+@_styled
+def strength_curves(
+    panels: Mapping[str, Mapping[str, Curve]], *, title: str = "", columns: int = 3
+) -> Figure:
+    """Success against the strength of shifts: a panel per shift, methods overlaid, intervals.
+
+    Args:
+      panels: shift -> method -> counts at strengths; at 0 nothing is shifted.
+      title: above the figure.
+      columns: most panels in a row.
+    """
+    panels = {shift: curves for shift, curves in panels.items() if curves}
+    if not panels:
+        return _empty("no strengths to draw")
+    rows = math.ceil(len(panels) / columns)
+    columns = math.ceil(len(panels) / rows)
+    width = 4.4 if len(panels) == 1 else 3.4
+    figure = Figure(
+        figsize=(columns * width + 0.3, 2.6 * rows + 0.5 + 0.3 * bool(title)), layout="constrained"
+    )
+    grid = figure.subplots(rows, columns, squeeze=False)
+    methods: dict[str, Curve] = {}
+    for index, (shift, curves) in enumerate(panels.items()):
+        axes = grid.flat[index]
+        every = np.concatenate([curve.at for curve in curves.values()])
+        room = 0.06 * max(float(np.ptp(every)), 0.1)
+        axes.axvline(0.0, color=MUTED, linewidth=1, dashes=(4, 2))
+        _curve_lines(axes, curves, np.asarray, spread=room / 4)
+        axes.set_xlim(every.min() - room, every.max() + room)
+        axes.set_title(paper.domain_title(shift))
+        axes.set_xlabel("strength   (dashed: none)")
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=5, steps=[1, 2, 5, 10]))
+        axes.xaxis.set_major_formatter("{x:g}")
+        if index % columns:
+            axes.set_ylabel("")
+        methods |= curves
+    for axes in grid.flat[len(panels) :]:
+        axes.set_visible(False)
+    _curve_legend(figure, methods)
+    if title:
+        figure.suptitle(title, x=0.01, ha="left", fontweight="bold", fontsize=11)
+    return figure
+
+
+def _curve_lines(
+    axes: Axes,
+    curves: Mapping[str, Curve],
+    scale: Callable[[Array], Array],
+    *,
+    spread: float,
+) -> None:
+    """Success with intervals over `scale(curve.at)`, methods apart by up to `spread` in all."""
     few = len(curves) <= 3
-    spread = 0.9 if len(curves) > 1 else 0.0
     for index, (method, curve) in enumerate(curves.items()):
         style = look(method)
-        rate = success_rate(curve.successes, curve.episodes)
-        lower, upper = wilson_interval(curve.successes, curve.episodes)
-        # A little sideways, so that bars do not hide each other.
-        shift = spread * (index / max(len(curves) - 1, 1) - 0.5)
-        angle = np.degrees(curve.angles) + shift
         seen = curve.episodes > 0
+        good, total = curve.successes[seen], curve.episodes[seen]
+        rate, (lower, upper) = success_rate(good, total), wilson_interval(good, total)
+        # A little sideways, so that bars do not hide each other.
+        shift = spread * (index / (len(curves) - 1) - 0.5) if len(curves) > 1 else 0.0
+        at = scale(curve.at[seen]) + shift
         if few:
-            axes.fill_between(
-                angle[seen], lower[seen], upper[seen], color=style.colour, alpha=0.13, linewidth=0
-            )
+            axes.fill_between(at, lower, upper, color=style.colour, alpha=0.13, linewidth=0)
         # With many methods the bars of all but the two protagonists step back.
         front = few or method in ("palm", "bc")
         axes.errorbar(
-            angle[seen],
-            rate[seen],
-            yerr=_bars(rate[seen], lower[seen], upper[seen]),
+            at,
+            rate,
+            yerr=_bars(rate, lower, upper),
             fmt="none",
             ecolor=style.colour,
             elinewidth=1,
@@ -358,8 +419,8 @@ def angle_curves(curves: Mapping[str, Curve], regions: Regions, *, title: str = 
             zorder=3 if front else 2,
         )
         axes.plot(
-            angle[seen],
-            rate[seen],
+            at,
+            rate,
             color=style.colour,
             marker=style.marker,
             markersize=4.5,
@@ -369,15 +430,27 @@ def angle_curves(curves: Mapping[str, Curve], regions: Regions, *, title: str = 
             clip_on=False,
             label=paper.method_label(method),
         )
-    axes.set_xlim(-reach, reach)
-    ticks = np.arange(-math.floor(reach / 10) * 10, reach, 10)
-    axes.set_xticks(ticks, [_degrees(tick) for tick in ticks])
-    axes.set_xlabel("camera angle about the workspace centre   (shaded: test range)")
     _percent_axis(axes)
-    figure.legend(loc="outside upper center", ncols=min(len(curves), 3 if len(curves) > 4 else 4))
-    if title:
-        axes.set_title(title, pad=14)
-    return figure
+
+
+def _curve_legend(figure: Figure, curves: Mapping[str, Curve]) -> None:
+    """One entry per method above the axes."""
+    figure.legend(
+        handles=[
+            Line2D(
+                [],
+                [],
+                color=look(method).colour,
+                marker=look(method).marker,
+                markersize=4.5,
+                linestyle=look(method).dash,
+                label=paper.method_label(method),
+            )
+            for method in curves
+        ],
+        loc="outside upper center",
+        ncols=min(len(curves), 3 if len(curves) > 4 else 4),
+    )
 
 
 def _degrees(value: float) -> str:
@@ -574,7 +647,7 @@ def domain_bars(
         for border in np.arange(len(shown) - 1) + 0.5:
             axes.axvline(border, color=FAINT, linewidth=0.8)
         axes.set_xlim(-0.5, columns - 0.5)
-        axes.set_xticks(range(len(shown)), [paper.domain_label(name) for name in shown])
+        axes.set_xticks(range(len(shown)), [_domain_name(name) for name in shown])
         axes.tick_params(axis="x", length=0, labelsize=9, labelcolor=INK)
         _percent_axis(axes)
     handles: list[Any] = [
@@ -798,12 +871,19 @@ def gallery(
                 axes.set_facecolor("#f1f3f5")
                 axes.set_aspect("equal")
             if i == 0:
-                axes.set_title(paper.domain_label(domain), loc="center", pad=4)
+                axes.set_title(_domain_name(domain), loc="center", pad=4)
             if j == 0:
-                axes.set_ylabel(_wrapped(name), fontsize=8.5, fontweight="bold", color=INK)
+                words = _wrapped(name)
+                size = 8.5 if max(map(len, words.split("\n"))) <= 15 else 7.0
+                axes.set_ylabel(words, fontsize=size, fontweight="bold", color=INK)
     if title:
         figure.suptitle(title + "\n", x=0.01, ha="left", fontweight="bold", fontsize=11)
     return figure
+
+
+def _domain_name(domain: str) -> str:
+    """A domain's short label; one that is long in lines that fit into a column."""
+    return textwrap.fill(paper.domain_label(domain), 12, break_long_words=False)
 
 
 def _wrapped(name: str) -> str:

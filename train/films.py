@@ -1,4 +1,4 @@
-"""Episodes as seen: traces kept while a domain is evaluated, drawn afterwards."""
+"""Episodes as seen: traces kept while a domain is evaluated, drawn afterwards by its runner."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ import numpy as np
 
 from palm_jax.align import AlignSpec
 from palm_jax.envs.base import EnvParams, State
-from palm_jax.envs.rollout import Runner, repeat_params
+from palm_jax.envs.rollout import Runner, take_params
 
 FULL_SIZE = 224
 """Side of the full frame in videos, pixels."""
@@ -43,32 +43,38 @@ class Film:
     success: bool
 
 
+@dataclasses.dataclass(frozen=True)
 class Camera:
-    """Draws traces; compiled once for a runner."""
+    """Draws the traces of a domain: as a policy saw it, and the paper's full frame."""
 
-    def __init__(self, runner: Runner, *, size: int = FULL_SIZE) -> None:
-        self.runner = runner
-        self._full = jax.jit(
-            jax.vmap(lambda state, params: runner.env.render(state, params, size).rgb)
-        )
+    runner: Runner  # that played the domain
+    params: EnvParams  # of its scenes, leading axis [count]
+    spec: AlignSpec  # what the policy sees, see `Env.observe`
+    frame: int
 
-    def film(self, trace: Trace, world: int, spec: AlignSpec, *, frame: int) -> Film:
-        """The episode of one world; see `Env.observe` for `spec` and `frame`."""
+    def film(self, trace: Trace, world: int) -> Film:
+        """The episode of one world."""
         length = trace.length(world)
-        inputs, frames = [], []
-        for state, params, count in self._states(trace, world, length):
-            inputs.append(
-                np.asarray(self.runner.observe(state, params, spec, frame=frame).image)[:count]
-            )
-            frames.append(np.asarray(self._full(state, params))[:count])
-        solved = bool(np.stack(trace.solved)[:, world].any())
-        return Film(np.concatenate(inputs), np.concatenate(frames), solved)
+        parts = [
+            (inputs[:count], frames[:count])
+            for inputs, frames, count in self._pictures(trace, world, length)
+        ]
+        inputs, frames = (np.concatenate(pictures) for pictures in zip(*parts, strict=True))
+        return Film(inputs, frames, bool(np.stack(trace.solved)[:, world].any()))
 
-    def first(self, trace: Trace, spec: AlignSpec, *, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    def first(self, trace: Trace) -> tuple[np.ndarray, np.ndarray]:
         """Policy input and full frame of world 0 at the start of its episode."""
-        state, params, _ = next(self._states(trace, 0, 1))
-        seen = self.runner.observe(state, params, spec, frame=frame)
-        return np.asarray(seen.image)[0], np.asarray(self._full(state, params))[0]
+        inputs, frames, _ = next(self._pictures(trace, 0, 1))
+        return inputs[0], frames[0]
+
+    def _pictures(
+        self, trace: Trace, world: int, length: int
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, int]]:
+        """Batches of the runner's size: policy inputs, full frames, and how many of them count."""
+        for state, params, count in self._states(trace, world, length):
+            seen = self.runner.observe(state, params, self.spec, frame=self.frame)
+            full = self.runner.render(state, params, FULL_SIZE)
+            yield np.asarray(seen.image), np.asarray(full), count
 
     def _states(
         self, trace: Trace, world: int, length: int
@@ -76,7 +82,7 @@ class Camera:
         """Batches of the runner's size of consecutive states of one world."""
         assert trace.last is not None
         worlds = self.runner.worlds
-        params = repeat_params(self.runner.env.default_params(), worlds)
+        params = take_params(self.params, np.full(worlds, world))
 
         def fixed(array: jax.Array) -> jax.Array:
             return jnp.broadcast_to(array[world], (worlds, *array.shape[1:]))

@@ -1,4 +1,4 @@
-"""From episodes and sweeps to counts per cell of the table and per camera angle."""
+"""From episodes and sweeps to counts per cell of the table, camera angle or strength."""
 
 import math
 from collections.abc import Iterable
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from palm_jax.train.records import DomainRecord, Sweep
+from palm_jax.train.records import DomainRecord, StrengthSweep, Sweep
 
 Array = NDArray[np.float64]
 
@@ -55,9 +55,9 @@ class Grid:
 
 @dataclass(frozen=True)
 class Curve:
-    """Counts at camera angles [A] in radians."""
+    """Counts along one axis of shift: [A] camera angles in radians, or strengths."""
 
-    angles: Array
+    at: Array
     successes: Array
     episodes: Array
 
@@ -87,6 +87,12 @@ def curve_of_sweep(sweep: Sweep) -> Curve:
     solved = sweep.solved
     counts = solved.sum(axis=(1, 2, 3)).astype(float)
     return Curve(sweep.angles, counts, np.full(counts.shape, float(solved[0].size)))
+
+
+def curve_of_strengths(sweep: StrengthSweep) -> Curve:
+    """Success over the strength of a shift."""
+    counts = sweep.solved.sum(axis=1).astype(float)
+    return Curve(sweep.strengths, counts, np.full(counts.shape, float(sweep.success.shape[1])))
 
 
 def positions(records: Iterable[DomainRecord]) -> tuple[Array, NDArray[np.bool_]]:

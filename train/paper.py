@@ -123,16 +123,18 @@ def domain_key(name: str) -> str:
 
 
 def domain_label(name: str) -> str:
-    """Short label as in the paper's tables: ID, W, V, E, W+V, W+E, V+E, All."""
+    """Short label as in the paper's tables: ID, W, V, E, W+V, W+E, V+E, All; others in words."""
     key = domain_key(name)
-    if key not in DOMAINS or key == "ID":
+    if key not in DOMAINS:
+        return domain_title(name)
+    if key == "ID":
         return key
     return "All" if key == "WVE" else "+".join(key)
 
 
 def domain_title(name: str) -> str:
-    """The domain in words; an unknown name as it is."""
-    return DOMAINS.get(domain_key(name), name)
+    """The domain in words: "object color + workspace"."""
+    return DOMAINS.get(domain_key(name)) or name.replace("_", " ").replace("+", " + ")
 
 
 def ordered_domains(names: list[str]) -> list[str]:

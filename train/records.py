@@ -6,7 +6,9 @@ A run folder holds::
 
 `eval.json` is `{domain: {"successes": int, "episodes": int, "nan": int}}`; `eval.npz` holds the
 same episodes one by one as arrays named `domain/field`, the fields of `DomainRecord`; `sweep.npz`
-holds the arrays of `Sweep`. Readers raise `RecordError`, which names the file and the problem.
+holds the arrays of `Sweep`, `strength-SHIFT.npz` those of `StrengthSweep`; a sweep with another
+robot than the trained one has `-ROBOT` at the end of its name. Readers raise `RecordError`, which
+names the file and the problem.
 """
 
 import io
@@ -38,6 +40,7 @@ class DomainRecord:
     object_xy: NDArray[np.float32]  # [N, 2] metres, world: the target object at the start
     camera_angle: NDArray[np.float32]  # [N] radians about the workspace centre; 0 in training
     length: NDArray[np.int32]  # [N] control steps until success or the end
+    draws: NDArray[np.int32]  # [N] start poses drawn until one was in reach; 0: not recorded
 
     @property
     def episodes(self) -> int:
@@ -65,17 +68,37 @@ class Sweep:
         return self.success & ~self.nan
 
 
+@dataclass(frozen=True)
+class StrengthSweep:
+    """S episodes at every strength of one shift; scene s is the same at all of them."""
+
+    shift: str
+    strengths: NDArray[np.float64]  # [K]
+    success: NDArray[np.bool_]  # [K, S]
+    nan: NDArray[np.bool_]  # [K, S]
+
+    @property
+    def solved(self) -> NDArray[np.bool_]:
+        """[K, S] successes that count: a non-finite episode never does."""
+        return self.success & ~self.nan
+
+
 _DTYPES: dict[str, Any] = {
     "success": np.bool_,
     "nan": np.bool_,
     "object_xy": np.float32,
     "camera_angle": np.float32,
     "length": np.int32,
+    "draws": np.int32,
 }
 
 
 def domain_record(values: Mapping[str, ArrayLike], *, where: str = "record") -> DomainRecord:
-    """Check and convert the five arrays of one domain; `where` names them in errors."""
+    """Check and convert the arrays of one domain; `where` names them in errors.
+
+    `draws` may be missing: it was not always recorded.
+    """
+    values = {"draws": np.zeros(np.shape(values.get("success", ())), np.int32), **values}
     missing = sorted(set(_DTYPES) - set(values))
     if missing:
         raise RecordError(f"{where}: missing {', '.join(missing)}; expected {', '.join(_DTYPES)}")
@@ -130,6 +153,45 @@ def save_eval(path: Path, records: Mapping[str, Mapping[str, ArrayLike] | Domain
 def save_sweep(path: Path, sweep: Sweep) -> Path:
     """Write sweep.npz, whole or not at all."""
     return _write_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
+
+
+def sweep_path(folder: Path, robot: str = "", *, shift: str = "") -> Path:
+    """Where a run's sweep is: over the grid, or over the strength of a shift.
+
+    Args:
+      folder: the run's.
+      robot: "" for the one that the policy was trained on.
+      shift: "" for the grid of positions and camera angles.
+    """
+    stem = f"strength-{shift}" if shift else "sweep"
+    return folder / f"{stem}{f'-{robot}' if robot else ''}.npz"
+
+
+def swept_robot(path: Path) -> str:
+    """The robot in a sweep's file name, "" for the trained one: the reverse of `sweep_path`."""
+    words = path.stem.split("-")
+    return "-".join(words[2 if words[0] == "strength" else 1 :])
+
+
+def save_strengths(path: Path, sweep: StrengthSweep) -> Path:
+    """Write a `StrengthSweep`, whole or not at all."""
+    return _write_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
+
+
+def load_strengths(path: Path) -> StrengthSweep:
+    """Read a `StrengthSweep`."""
+    arrays = _load_arrays(path)
+    missing = {field.name for field in fields(StrengthSweep)} - set(arrays)
+    if missing:
+        raise RecordError(f"{path}: missing {', '.join(sorted(missing))}")
+    strengths = np.atleast_1d(arrays["strengths"]).astype(float)
+    success, nan = arrays["success"].astype(bool), arrays["nan"].astype(bool)
+    if success.ndim != 2 or len(success) != len(strengths) or nan.shape != success.shape:
+        raise RecordError(
+            f"{path}: expected success and nan of shape [{len(strengths)}, S], "
+            f"got {success.shape} and {nan.shape}"
+        )
+    return StrengthSweep(str(arrays["shift"]), strengths, success, nan)
 
 
 def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
@@ -80,6 +81,7 @@ def draw(methods: Mapping[str, list[Run]], folder: Path, prefix: str) -> list[tu
             "(above), and scenes per ten degrees of camera rotation (below).",
         )
     made += _draw_sweeps(methods, episodes, regions, folder, prefix)
+    made += _draw_strengths(methods, folder, prefix)
     metrics = {name: runs[0].metrics for name, runs in methods.items() if runs[0].metrics}
     if metrics:
         add(
@@ -98,34 +100,66 @@ def _draw_sweeps(
     folder: Path,
     prefix: str,
 ) -> list[tuple[Path, str]]:
-    """Heatmaps and angle curves: from sweeps where there are any, else from the evaluation."""
-    sweeps = {
-        name: run.sweep for name, runs in methods.items() for run in runs[:1] if run.sweep
-    }  # the first seed: seeds may have been swept over different grids
-    if sweeps:
-        where = "from a sweep over positions and camera angles (first seed)"
-        maps = {name: grids.grid_of_sweep(sweep) for name, sweep in sweeps.items()}
-        curves = {name: grids.curve_of_sweep(sweep) for name, sweep in sweeps.items()}
-    else:
-        where = "from the scenes of the evaluation"
-        maps = {
-            name: grids.grid_of_records(chosen, regions)
-            for name, by_domain in episodes.items()
-            if (chosen := _domains(by_domain, "ID", "W"))
-        }
-        curves = {
-            name: grids.curve_of_records(chosen, regions)
-            for name, by_domain in episodes.items()
-            if (chosen := _domains(by_domain, "V"))
-        }
+    """Heatmaps and angle curves, a pair for each robot that was swept with.
+
+    Those of the trained robot come from the evaluation where there is no sweep.
+    """
+    # The first seed: seeds may have been swept over different grids.
+    first = {name: runs[0].sweeps for name, runs in methods.items()}
     made = []
-    if maps:
-        path = figures.save(figures.heatmaps(maps, regions), folder / f"{prefix}heatmap.png")
-        made.append((path, f"Success over the object's start position, {where}."))
-    if curves and any(len(curve.angles) > 1 for curve in curves.values()):
-        path = figures.save(figures.angle_curves(curves, regions), folder / f"{prefix}angles.png")
-        made.append((path, f"Success over the camera's rotation, {where}; Wilson 95 % intervals."))
+    for robot in sorted({"", *(robot for sweeps in first.values() for robot in sweeps)}):
+        sweeps = {name: by_robot[robot] for name, by_robot in first.items() if robot in by_robot}
+        if sweeps:
+            where = "from a sweep over positions and camera angles (first seed)"
+            maps = {name: grids.grid_of_sweep(sweep) for name, sweep in sweeps.items()}
+            curves = {name: grids.curve_of_sweep(sweep) for name, sweep in sweeps.items()}
+        else:
+            where = "from the scenes of the evaluation"
+            maps = {
+                name: grids.grid_of_records(chosen, regions)
+                for name, by_domain in episodes.items()
+                if (chosen := _domains(by_domain, "ID", "W"))
+            }
+            curves = {
+                name: grids.curve_of_records(chosen, regions)
+                for name, by_domain in episodes.items()
+                if (chosen := _domains(by_domain, "V"))
+            }
+        suffix, actor = _robot_words(robot)
+        if maps:
+            file = folder / f"{prefix}heatmap{suffix}.png"
+            figures.save(figures.heatmaps(maps, regions), file)
+            made.append((file, f"Success{actor} over the object's start position, {where}."))
+        if any(len(curve.at) > 1 for curve in curves.values()):
+            file = folder / f"{prefix}angles{suffix}.png"
+            figures.save(figures.angle_curves(curves, regions), file)
+            text = f"Success{actor} over the camera's rotation, {where}; Wilson 95 % intervals."
+            made.append((file, text))
     return made
+
+
+def _draw_strengths(
+    methods: Mapping[str, list[Run]], folder: Path, prefix: str
+) -> list[tuple[Path, str]]:
+    """Curves over the strength of shifts, a figure for each robot that was swept with."""
+    panels: dict[str, dict[str, dict[str, grids.Curve]]] = {}  # robot -> shift -> method
+    for name, runs in methods.items():
+        for (robot, shift), found in runs[0].strengths.items():
+            by_shift = panels.setdefault(robot, {}).setdefault(shift, {})
+            by_shift[name] = grids.curve_of_strengths(found)
+    made = []
+    for robot, shown in sorted(panels.items()):
+        suffix, actor = _robot_words(robot)
+        file = folder / f"{prefix}strength{suffix}.png"
+        figures.save(figures.strength_curves(shown), file)
+        text = f"Success{actor} over the strength of a shift (first seed); Wilson 95 % intervals."
+        made.append((file, text))
+    return made
+
+
+def _robot_words(robot: str) -> tuple[str, str]:
+    """What a file name and a caption say of the robot; nothing for the trained one."""
+    return (f"-{robot}", f" with the robot {robot}") if robot else ("", "")
 
 
 def _domains(
@@ -171,6 +205,8 @@ def facts(runs: Sequence[Run]) -> dict[str, str]:
             paper.method_label(m) for m in paper.ordered_methods(list({run.method for run in runs}))
         ),
         "preset": first("preset"),
+        "robot": first("robot"),
+        "embodiment": first("other_robot") if any(map(_embodied, runs)) else "",
         "seeds": first("seed"),
         "date": first("date", "started", "time"),
         "wall time": wall,
@@ -180,6 +216,10 @@ def facts(runs: Sequence[Run]) -> dict[str, str]:
         "commit": first("commit", "git_sha", "git"),
     }
     return {name: value for name, value in entries.items() if value}
+
+
+def _embodied(run: Run) -> bool:
+    return any("E" in domain for domain in run.counts if domain in paper.DOMAINS)
 
 
 def _seconds(env: Mapping[str, Any]) -> float | None:
@@ -218,7 +258,7 @@ def variant_notes(runs: Iterable[Run]) -> list[str]:
     for run in runs:
         others = {name: entry for name, entry in run.variants.items() if name != run.quoted}
         for name, entry in others.items():
-            turned = [d for d in entry if "V" in d and d in paper.DOMAINS]
+            turned = [d for d in entry if ("V" if d in paper.DOMAINS else "viewpoint") in d]
             numbers = ", ".join(
                 f"{paper.domain_label(d)} {entry[d]['successes']}/{entry[d]['episodes']}"
                 f" (quoted: {run.counts[d]['successes']}/{run.counts[d]['episodes']})"
@@ -232,6 +272,25 @@ def variant_notes(runs: Iterable[Run]) -> list[str]:
                 f"{numbers or 'no turned domains'}."
             )
     return notes
+
+
+def draw_notes(runs: Sequence[Run]) -> list[str]:
+    """How many start poses had to be drawn until the arm could reach one, where it was recorded."""
+    found: dict[str, list[int]] = {}
+    for run in runs:
+        for domain, record in run.episodes.items():
+            found.setdefault(paper.domain_key(domain), []).extend(record.draws[record.draws > 0])
+    again = {domain: draws for domain, draws in found.items() if draws and max(draws) > 1}
+    if not any(found.values()):
+        return []
+    numbers = ", ".join(
+        f"{paper.domain_label(d)} {np.mean(again[d]):.2f} (most {max(again[d])})"
+        for d in paper.ordered_domains(list(again))
+    )
+    return [
+        "A start pose out of the arm's reach is drawn again. Mean number of draws: "
+        + (f"{numbers}; 1 in other domains." if again else "1 in every domain.")
+    ]
 
 
 def footnotes(runs: Sequence[Run]) -> list[str]:
@@ -258,6 +317,7 @@ def footnotes(runs: Sequence[Run]) -> list[str]:
             f"{bad} of {total} episodes went non-finite (NaN); such episodes are counted, as "
             "failures."
         )
+    notes += draw_notes(runs)
     notes += variant_notes(runs)
     notes.append(
         "Degradation is 1 − OOD / ID with each method's own in-domain success, so a method that "

@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 
 from palm_jax.align import procedural_bank
-from palm_jax.envs import physics, registry
+from palm_jax.envs import physics, shifts
 from palm_jax.envs.rollout import Runner
 from palm_jax.train import (
     checkpoint,
@@ -31,10 +31,12 @@ from palm_jax.train import (
 )
 from palm_jax.train import console as terminal
 from palm_jax.train.config import Config, command, default_out
-from palm_jax.train.evaluate import VIEW, Evaluator, evaluate, quoted
+from palm_jax.train.evaluate import VIEW, Evaluator, Runners, evaluate, quoted, turned
 from palm_jax.train.metrics import MetricsLog, write_json
 
-_FILMED = "workspace+viewpoint"
+_FILMED = ("workspace+viewpoint", "workspace+viewpoint+embodiment")
+"""Domains of which videos are made, where they are evaluated."""
+
 _BANK = 128  # background textures for Random Overlay
 _SELECTION_SEED = 500  # scenes that score checkpoints: never those of the evaluation
 
@@ -75,6 +77,7 @@ def execute(config: Config, console: Console) -> Path:
     Raises:
       ConfigError: the folder holds another run.
       DemoFileError: the demonstrations cannot be used.
+      StartPoseError: a domain asks for start poses that an arm cannot take.
       Interrupted: stopped on request.
     """
     start = time.monotonic()
@@ -90,19 +93,23 @@ def execute(config: Config, console: Console) -> Path:
             "task": config.task,
             "methods": ", ".join(config.method),
             "preset": config.preset,
-            "robot": config.robot,
+            "robot": _robots(config),
             "device": jax.devices()[0],
             "folder": out,
         },
     )
-    runner = Runner(registry.make(config.task, config.robot), _worlds(config))
-    data = _demonstrations(config, runner, console)
+    runners = Runners.of(config.task, config.robot, config.second_robot, _worlds(config))
+    # One for each method throughout: what it has compiled, it keeps.
+    evaluators = {
+        name: workspace.make_evaluator(config, methods.find(name), runners) for name in folders
+    }
+    data = _demonstrations(config, runners.first, console)
     for name, folder in folders.items():
         began = time.monotonic()
-        _one_method(config, methods.find(name), runner, data, folder, console)
+        _one_method(config, evaluators[name], data, folder, console)
         _note_environment(config, folder, time.monotonic() - began)
     if config.sweep:
-        _sweeps(config, runner, folders, console)
+        _sweeps(evaluators, folders, console)
     _gallery(folders, out)
     report.write_report(out)
     counts = {name: records.load_counts(folder / "eval.json") for name, folder in folders.items()}
@@ -113,6 +120,12 @@ def execute(config: Config, console: Console) -> Path:
         f"Report: {out / 'report.html'}   ({terminal.duration(time.monotonic() - start)})"
     )
     return out
+
+
+def _robots(config: Config) -> str:
+    if not any(map(shifts.other_robot, config.domains)):
+        return config.robot
+    return f"{config.robot}, {config.second_robot} in embodiment domains"
 
 
 def _worlds(config: Config) -> int:
@@ -155,17 +168,16 @@ def _demonstrations(config: Config, runner: Runner, console: Console) -> demos.D
 
 def _one_method(
     config: Config,
-    method: methods.Method,
-    runner: Runner,
+    evaluator: Evaluator,
     data: demos.Demos,
     folder: Path,
     console: Console,
 ) -> None:
+    method = evaluator.method
     if (folder / "eval.json").exists():
         console.print(f"{method.name}: trained and evaluated already")
         return
-    evaluator = workspace.make_evaluator(config, method, runner)
-    spec = method.spec(runner.env.task, config.image_size)
+    spec, runner = method.spec(evaluator.task, config.image_size), evaluator.runner
     images, proprio, cameras = demos.render_observations(runner, data, spec, frame=method.frame)
     batch = learner.Batch(
         {VIEW: images}, proprio, data.actions, cameras={VIEW: cameras}, tcp=data.tcp[:, :3, 3]
@@ -277,66 +289,84 @@ def _evaluate(config: Config, evaluator: Evaluator, folder: Path, console: Conso
     variants = {name: records.counts(domains) for name, domains in results.items()}
     write_json(folder / "eval_variants.json", {"quoted": chosen, **variants})
     # A domain whose camera does not turn was run in the first variant only.
-    shown = {d: t for (v, d), t in traces.items() if v == chosen or "viewpoint" not in d}
-    _film(config, evaluator, shown, folder)
+    shown = {d: t for (v, d), t in traces.items() if v == chosen or not turned(d)}
+    _film(config, evaluator, shown, folder, aligned=chosen == "aligned")
     # Written last: its presence says that the method is finished.
     write_json(folder / "eval.json", variants[chosen])
 
 
 def _film(
-    config: Config, evaluator: Evaluator, traces: dict[str, films.Trace], folder: Path
+    config: Config,
+    evaluator: Evaluator,
+    traces: dict[str, films.Trace],
+    folder: Path,
+    *,
+    aligned: bool,
 ) -> None:
     """Videos of a few successes and failures, and the first view of every domain."""
-    camera, method = films.Camera(evaluator.runner), evaluator.method
+    method = evaluator.method
     spec = method.spec(evaluator.task, config.image_size)
+
+    def camera(domain: str) -> films.Camera:
+        scenes = evaluator.scenes(
+            domain, seed=config.eval_seed, count=config.scenes, aligned=aligned
+        )
+        return films.Camera(evaluator.runners.domain(domain), scenes, spec, method.frame)
+
     views: dict[str, np.ndarray] = {}
     for domain, trace in traces.items():
-        views[f"input/{domain}"], views[f"frame/{domain}"] = camera.first(
-            trace, spec, frame=method.frame
-        )
+        views[f"input/{domain}"], views[f"frame/{domain}"] = camera(domain).first(trace)
     np.savez_compressed(folder / "views.npz", **views)  # type: ignore[arg-type]
-    trace = traces.get(_FILMED) or next(iter(traces.values()))
-    solved = np.stack(trace.solved).any(0)
+    for domain in [d for d in _FILMED if d in traces] or list(traces)[:1]:
+        _film_domain(config, method, domain, camera(domain), traces[domain], folder)
+
+
+def _film_domain(
+    config: Config,
+    method: methods.Method,
+    domain: str,
+    camera: films.Camera,
+    trace: films.Trace,
+    folder: Path,
+) -> None:
+    """The first `config.videos` successes and failures of one domain."""
+    solved = np.stack(trace.solved)[:, : config.scenes].any(axis=0)
     for outcome, worlds in (
         ("success", np.flatnonzero(solved)),
         ("failure", np.flatnonzero(~solved)),
     ):
         for number, world in enumerate(worlds[: config.videos]):
-            film = camera.film(trace, int(world), spec, frame=method.frame)
+            film = camera.film(trace, int(world))
             frames = videos.episode_frames(
                 film.inputs,
                 film.frames,
                 method=method.name,
-                domain=_FILMED,
+                domain=domain,
                 success=film.success,
                 task=config.task,
             )
-            name = f"{method.name}_{_FILMED.replace('+', '_')}_{outcome}{number + 1}.mp4"
+            name = f"{method.name}_{domain.replace('+', '_')}_{outcome}{number + 1}.mp4"
             videos.write_video(folder / "videos" / name, frames)
 
 
-def _sweeps(config: Config, runner: Runner, folders: dict[str, Path], console: Console) -> None:
+def _sweeps(evaluators: dict[str, Evaluator], folders: dict[str, Path], console: Console) -> None:
     """A coarse sweep of every policy; `python -m palm_jax sweep RUN` makes finer ones."""
     options = sweep.SweepConfig(run=Path())
-    angles, (xs, ys) = sweep.angles_of(options.camera), sweep.cells_of(options.workspace)
+    job = sweep.job(options)
     for name, folder in folders.items():
-        if (folder / "sweep.npz").exists():
+        path = records.sweep_path(folder)
+        if path.exists():
             continue
-        evaluator = workspace.make_evaluator(config, methods.find(name), runner)
-        total = len(angles) * len(xs) * len(ys) * options.episodes
-        with terminal.ProgressBar(console, total, f"sweep {name}", unit="episode") as bar:
-            found = sweep.sweep(
+        evaluator = evaluators[name]
+        with terminal.ProgressBar(console, job.episodes, f"sweep {name}", unit="episode") as bar:
+            found = job.run(
                 evaluator,
                 workspace.best_policy(folder, evaluator.learner),
-                angles=angles,
-                xs=xs,
-                ys=ys,
-                episodes=options.episodes,
                 seed=options.seed,
                 aligned=workspace.quoted_variant(folder) == "aligned",
                 progress=bar.advance,
             )
-        records.save_sweep(folder / "sweep.npz", found)
+        job.save(path, found)
 
 
 def _gallery(folders: dict[str, Path], out: Path) -> None:

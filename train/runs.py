@@ -25,7 +25,10 @@ class Run:
     env: dict[str, Any] = field(default_factory=dict)
     counts: Counts = field(default_factory=dict)
     episodes: dict[str, records.DomainRecord] = field(default_factory=dict)
-    sweep: records.Sweep | None = None
+    sweeps: dict[str, records.Sweep] = field(default_factory=dict)  # by robot, "" the trained one
+    strengths: dict[tuple[str, str], records.StrengthSweep] = field(
+        default_factory=dict
+    )  # by robot and shift
     quoted: str = ""  # which variant of the hand's initial yaw `counts` are of
     variants: dict[str, Counts] = field(default_factory=dict)
     metrics: list[dict[str, Any]] = field(default_factory=list)
@@ -72,7 +75,12 @@ def load_run(path: Path) -> Run:
     run.env = read("env.json", records.load_json, {})
     run.counts = read("eval.json", records.load_counts, {})
     run.episodes = read("eval.npz", records.load_eval, {})
-    run.sweep = read("sweep.npz", records.load_sweep, None)
+    for file in sorted(path.glob("sweep*.npz")):
+        if (sweep := read(file.name, records.load_sweep, None)) is not None:
+            run.sweeps[records.swept_robot(file)] = sweep
+    for file in sorted(path.glob("strength-*.npz")):
+        if (strengths := read(file.name, records.load_strengths, None)) is not None:
+            run.strengths[records.swept_robot(file), strengths.shift] = strengths
     run.metrics, complaints = read("metrics.jsonl", records.load_metrics, ([], []))
     run.problems += complaints
     if not run.counts and run.episodes:

@@ -1,5 +1,8 @@
 """`python -m palm_jax sweep RUN`: success over camera angle x workspace, as heatmaps and curves.
 
+With `--shift NAME` it is success over the strength of one shift, as a curve; with `--robot NAME`
+another robot acts than the one that the policy was trained on.
+
 The grid is a `vmap` over `EnvParams`: every cell is the default distribution pinned to one object
 position and one camera angle; only the scenes' other randomness differs between the episodes of a
 cell.
@@ -8,40 +11,50 @@ cell.
 import dataclasses
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from rich.console import Console
 
 from palm_jax.envs import registry, shifts
 from palm_jax.envs.base import EnvParams
-from palm_jax.envs.rollout import Runner, take_params
+from palm_jax.envs.rollout import repeat_params, take_params
 from palm_jax.train import console as terminal
 from palm_jax.train import records, report, runs, workspace
-from palm_jax.train.evaluate import Evaluator
+from palm_jax.train.evaluate import Evaluator, Runners
 from palm_jax.train.learner import PolicyState
 
 
 @dataclasses.dataclass(frozen=True)
 class SweepConfig:
-    """Sweep the policies of a run folder (or of a folder of runs) over camera angle and workspace.
+    """Sweep the policies of a run folder (or of a folder of runs) over camera angle and workspace,
+    or over the strength of a shift.
 
     Attributes:
       run: a run folder, or a folder of run folders (drawn side by side).
+      robot: the robot to act with; by default the one that the policy was trained on.
       camera: LOW:HIGH:COUNT camera angles in degrees.
       workspace: COLUMNSxROWS object positions over the test region (x cells by y cells).
-      episodes: in every cell.
+      shift: sweep the strength of this shift instead of the grid of camera and workspace.
+      strength: LOW:HIGH:COUNT strengths; by default the shift's whole range.
+      episodes: in every cell (1 by default), or at every strength (24 by default).
       seed: of the scenes.
       batch: worlds simulated at once (at most 128 on a CPU).
       redo: sweep again where a sweep is there already.
     """
 
     run: tyro.conf.Positional[Path]
+    robot: str = ""
     camera: str = "-30:30:5"
     workspace: str = "5x7"
-    episodes: int = 1
+    shift: str = ""
+    strength: str = ""
+    episodes: int | None = None
     seed: int = 2000
     batch: int = 64
     redo: bool = False
@@ -53,13 +66,34 @@ def angles_of(text: str) -> np.ndarray:
     Raises:
       ValueError: anything else.
     """
-    match = re.fullmatch(r"(-?[\d.]+)(?::(-?[\d.]+):(\d+))?", text)
+    return np.radians(_range_of(text, "camera: expected LOW:HIGH:COUNT in degrees, e.g. -30:30:13"))
+
+
+def strengths_of(text: str) -> np.ndarray:
+    """Strengths `LOW:HIGH:COUNT`, or one.
+
+    Raises:
+      ValueError: anything else.
+    """
+    return _range_of(text, "strength: expected LOW:HIGH:COUNT, e.g. -1:1:5")
+
+
+def _range_of(text: str, expected: str) -> np.ndarray:
+    match = re.fullmatch(r"(-?\d*\.?\d+)(?::(-?\d*\.?\d+):(\d+))?", text)
     if not match or (match[3] is not None and int(match[3]) < 1):
-        raise ValueError(
-            f"camera: expected LOW:HIGH:COUNT in degrees, e.g. -30:30:13, got {text!r}"
-        )
+        raise ValueError(f"{expected}, got {text!r}")
     low, high, count = match[1], match[2] or match[1], int(match[3] or 1)
-    return np.radians(np.linspace(float(low), float(high), count))
+    return np.linspace(float(low), float(high), count)
+
+
+def default_strengths(shift: str) -> str:
+    """The whole range of a shift; of several together, what all of them take.
+
+    Raises:
+      ValueError: an unknown shift.
+    """
+    low = max(shifts.strength_range(name)[0] for name in shifts.parts(shift))
+    return f"{low:g}:1:5"
 
 
 def cells_of(text: str) -> tuple[np.ndarray, np.ndarray]:
@@ -130,39 +164,116 @@ def sweep(
     return records.Sweep(angles, xs, ys, success.reshape(shape), nan.reshape(shape))
 
 
+def sweep_strength(
+    evaluator: Evaluator,
+    policy: PolicyState,
+    *,
+    shift: str,
+    strengths: np.ndarray,
+    episodes: int,
+    seed: int,
+    aligned: bool,
+    progress: Callable[[int], None] | None = None,
+) -> records.StrengthSweep:
+    """Runs the same scenes at every strength of a shift.
+
+    Args:
+      evaluator: world, method and learner.
+      policy: from `Learner.policy_state`.
+      shift: a name of `SHIFTS` or `AXES`, or several joined by `+`.
+      strengths: [K].
+      episodes: S, the scenes.
+      seed: of the scenes.
+      aligned: whether the hand's initial yaw turns with the camera.
+      progress: told how many episodes were finished.
+
+    """
+    params = evaluator.runner.env.default_params()
+    if aligned:
+        params = shifts.aligned_hand(params)
+    success, nan = np.zeros((2, len(strengths), episodes), bool)
+    for row, strength in enumerate(strengths):
+        there = repeat_params(shifts.shifted(params, shift, strength=float(strength)), episodes)
+        result = evaluator.episodes(policy, jax.random.key(seed), there, episodes)
+        success[row], nan[row] = result.success, result.nan
+        if progress:
+            progress(episodes)
+    return records.StrengthSweep(shift, strengths, success, nan)
+
+
+class Job(NamedTuple):
+    """What a command asks for, the same for every policy."""
+
+    worlds: int  # in a batch
+    episodes: int  # in all
+    run: Callable[..., Any]  # `sweep` or `sweep_strength`, their grids bound
+    save: Callable[[Path, Any], Path]
+
+
+def job(config: SweepConfig) -> Job:
+    """What a configuration asks for.
+
+    Raises:
+      ValueError: a grid, strength or shift that is none.
+    """
+    if config.shift:
+        if not shifts.parts(config.shift) or shifts.other_robot(config.shift):
+            raise ValueError(
+                f"shift: expected shifts with a strength, got {config.shift!r}; "
+                "another robot is --robot"
+            )
+        strengths = strengths_of(config.strength or default_strengths(config.shift))
+        count = config.episodes or 24
+        run = partial(sweep_strength, shift=config.shift, strengths=strengths, episodes=count)
+        # Worlds beyond the scenes of one strength would run for nothing.
+        worlds = min(config.batch, count)
+        return Job(worlds, len(strengths) * count, run, records.save_strengths)
+    angles, (xs, ys) = angles_of(config.camera), cells_of(config.workspace)
+    count = config.episodes or 1
+    grid = partial(sweep, angles=angles, xs=xs, ys=ys, episodes=count)
+    return Job(config.batch, len(angles) * len(xs) * len(ys) * count, grid, records.save_sweep)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns the exit code."""
     config = tyro.cli(SweepConfig, args=argv, prog="python -m palm_jax sweep")
     console = terminal.make_console()
     try:
-        angles, (xs, ys) = angles_of(config.camera), cells_of(config.workspace)
-        folders = runs.find_runs(config.run) if config.run.is_dir() else []
-        if not folders:
-            raise FileNotFoundError(f"{config.run}: no run folder here")
-        runner: Runner | None = None
-        for folder in folders:
-            if (folder / "sweep.npz").exists() and not config.redo:
-                console.print(f"{folder}: swept already (--redo to sweep again)")
-                continue
-            stored = workspace.stored_config(folder)
-            if runner is None or runner.env.task.name != stored.task:
-                runner = Runner(registry.make(stored.task, stored.robot), config.batch)
-            evaluator, policy = workspace.load_policy(folder, runner)
-            total = len(angles) * len(xs) * len(ys) * config.episodes
-            with terminal.ProgressBar(console, total, f"sweep {evaluator.method.name}") as bar:
-                result = sweep(
-                    evaluator,
-                    policy,
-                    angles=angles,
-                    xs=xs,
-                    ys=ys,
-                    episodes=config.episodes,
-                    seed=config.seed,
-                    aligned=workspace.quoted_variant(folder) == "aligned",
-                    progress=bar.advance,
-                )
-            records.save_sweep(folder / "sweep.npz", result)
+        _run(config, console)
     except (ValueError, OSError) as error:
         console.print(f"error: {error}", markup=False)
         return 2
     return report.main([str(config.run)])
+
+
+def _run(config: SweepConfig, console: Console) -> None:
+    """Sweeps every run that the command is about, and writes the files."""
+    asked = job(config)
+    if config.robot and config.robot not in registry.ROBOTS:
+        raise ValueError(f"unknown robot {config.robot!r}; known: {', '.join(registry.ROBOTS)}")
+    folders = runs.find_runs(config.run) if config.run.is_dir() else []
+    if not folders:
+        raise FileNotFoundError(f"{config.run}: no run folder here")
+    runners: dict[tuple[str, str], Runners] = {}
+    for folder in folders:
+        stored = workspace.stored_config(folder)
+        robot = config.robot or stored.robot
+        path = records.sweep_path(
+            folder, "" if robot == stored.robot else robot, shift=config.shift
+        )
+        if path.exists() and not config.redo:
+            console.print(f"{folder}: swept already (--redo to sweep again)")
+            continue
+        world = stored.task, robot
+        if world not in runners:
+            runners[world] = Runners.of(stored.task, robot, stored.second_robot, asked.worlds)
+        evaluator, policy = workspace.load_policy(folder, runners[world])
+        with terminal.ProgressBar(console, asked.episodes, f"sweep {evaluator.method.name}") as bar:
+            found = asked.run(
+                evaluator,
+                policy,
+                seed=config.seed,
+                aligned=workspace.quoted_variant(folder) == "aligned",
+                progress=bar.advance,
+            )
+        asked.save(path, found)

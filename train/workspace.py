@@ -14,10 +14,10 @@ from typing import Any
 import jax
 
 from palm_jax.envs import shifts
-from palm_jax.envs.rollout import Runner
+from palm_jax.envs.registry import TASKS
 from palm_jax.train import checkpoint, methods, records
 from palm_jax.train.config import Config, ConfigError, command
-from palm_jax.train.evaluate import VIEW, Evaluator
+from palm_jax.train.evaluate import VIEW, Evaluator, Runners
 from palm_jax.train.learner import Learner, PolicyState, make_learner
 from palm_jax.train.metrics import write_json
 
@@ -49,6 +49,7 @@ def stored(config: Config, method: str) -> dict[str, Any]:
     }
     return {
         **values,
+        "other_robot": config.second_robot,
         "method": method,
         "frame": f"{methods.find(method).frame} px",
         "labels": "commanded deltas relative to the measured pose",
@@ -142,21 +143,21 @@ def stored_config(folder: Path) -> Config:
     return Config(**chosen)
 
 
-def make_evaluator(config: Config, method: methods.Method, runner: Runner) -> Evaluator:
+def make_evaluator(config: Config, method: methods.Method, runners: Runners) -> Evaluator:
     """The evaluator of a method under a configuration."""
-    size = method.spec(runner.env.task, config.image_size).proprio_size
+    size = method.spec(TASKS[config.task], config.image_size).proprio_size
     learner = make_learner(config.learner(method), size, (VIEW,))
-    return Evaluator(runner, method, learner, config.image_size)
+    return Evaluator(runners, method, learner, config.image_size)
 
 
-def load_policy(folder: Path, runner: Runner) -> tuple[Evaluator, PolicyState]:
+def load_policy(folder: Path, runners: Runners) -> tuple[Evaluator, PolicyState]:
     """The policy of a finished run: its best checkpoint by in-domain success.
 
     Raises:
       ConfigError: no whole, scored checkpoint in the folder.
     """
     config = stored_config(folder)
-    evaluator = make_evaluator(config, methods.find(config.method[0]), runner)
+    evaluator = make_evaluator(config, methods.find(config.method[0]), runners)
     return evaluator, best_policy(folder, evaluator.learner)
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from palm_jax.envs.shifts import DOMAINS
 from palm_jax.train import config as configs
 from palm_jax.train import methods
 from palm_jax.train.config import PRESETS, Config, ConfigError, command, default_out, parse
@@ -35,6 +36,21 @@ def test_the_papers_numbers() -> None:
     assert (config.width, config.norm, config.batch_size, config.scenes) == (64, "batch", 64, 50)
     assert (config.learning_rate, config.schedule) == (1e-4, "constant")
     assert config.steps == pytest.approx(600 * 10_000 / 64, rel=0.01)
+
+
+def test_the_other_robot_is_another_one() -> None:
+    """By default the first of the table that is not the demonstrations'."""
+    assert parse([]).second_robot == "ur5"
+    assert parse(["--robot", "ur5"]).second_robot == "panda"
+    chosen = parse(["--robot", "ur5", "--other-robot", "panda"])
+    assert chosen.second_robot == "panda"
+    assert parse(command(chosen)[3:]) == chosen
+
+
+def test_any_composition_of_shifts_is_a_domain() -> None:
+    assert parse([]).domains == DOMAINS and len(DOMAINS) == 8
+    given = ["in_domain", "lighting", "viewpoint_cone+object_color", "embodiment+distractors"]
+    assert parse(["--domains", *given]).domains == tuple(given)
 
 
 def test_options_override_the_preset() -> None:
@@ -83,7 +99,18 @@ def test_folders_are_named_after_what_is_in_them() -> None:
         (["--task", "lift_lids"], r"unknown task 'lift_lids' .*known: .*lift_spam"),
         (["--robot", "ur"], "unknown robot 'ur'.*known: panda"),
         (["--method", "palm", "bcc"], r"unknown method 'bcc' .*known: palm.*bc"),
-        (["--domains", "in_domain", "lights"], "unknown domain 'lights'.*known: in_domain"),
+        (
+            ["--domains", "in_domain", "workspace+light"],
+            r"unknown domain 'light' \(did you mean 'lighting'\?\); known: in_domain, workspace",
+        ),
+        (["--domains", "in_domain", "lighting+lighting"], "domains: .*'lighting' twice"),
+        (["--domains", "in_domain", "in_domain+workspace"], "domains: .*in_domain"),
+        (
+            ["--domains", "in_domain", "workspace+viewpoint", "viewpoint+workspace"],
+            r"domains: workspace\+viewpoint and viewpoint\+workspace are the same: give one",
+        ),
+        (["--other-robot", "panda"], "other_robot: expected another robot than robot = 'panda'"),
+        (["--other-robot", "ur3"], r"unknown robot 'ur3' \(did you mean 'ur5'\?\)"),
         (["--domains", "viewpoint"], "domains must contain in_domain"),
         (["--turn", "90", "0"], r"turn: expected degrees from 0 to 80, got \(90.0, 0.0\)"),
         (["--learning-rate", "-1"], "learning_rate is -1.0; expected 0 or more"),

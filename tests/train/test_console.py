@@ -145,6 +145,14 @@ def test_many_methods_get_a_row_each() -> None:
     assert table["mine"] == ["100", "88", "75", "0.19"]
 
 
+def test_the_mean_is_over_the_papers_domains() -> None:
+    """As in the paper: what it has no number for is shown, and in no mean."""
+    counts = {"palm": {**COUNTS["palm"], "lighting": {"successes": 0, "episodes": 24, "nan": 0}}}
+    table, _ = rows(counts)
+    assert table["lighting"] == ["0", "(0-14)", "1.00"]
+    assert table["OOD"] == ["mean", "0.19", "0.02"]
+
+
 def test_no_results_no_table() -> None:
     console, out = plain()
     printing.results(console, {"palm": {}})

@@ -15,6 +15,7 @@ import worlds
 from oracles import delta
 
 from palm_jax.align import project
+from palm_jax.envs.expert import Demonstrator, Recording
 from palm_jax.train import demos
 from palm_jax.train.demos import DemoFileError
 
@@ -55,6 +56,7 @@ def test_the_layout_is_robomimics(recorded: Path) -> None:
             assert demo["actions"].shape == (length, 10)
             for name, shape in {"tcp": (4, 4), "opening": (), "qpos": (model.nq,)}.items():
                 assert demo[f"obs/{name}"].shape == (length, *shape)
+            assert demo["obs/stage"].shape == (length,) and demo["obs/stage"].dtype == np.int32
             np.testing.assert_allclose(np.diff(demo["states"][:, 0]), 0.05, atol=1e-6)
             np.testing.assert_array_equal(demo["states"][:, 1 : 1 + model.nq], demo["obs/qpos"])
             assert demo["dones"][-1] == 1 and not demo["dones"][:-1].any()
@@ -89,6 +91,7 @@ def test_reloaded_demonstrations_are_consistent(recorded: Path) -> None:
     assert len(found.qpos) == len(found.tcp) == len(found.actions) == len(found.episode)
     assert (np.diff(found.episode) >= 0).all() and set(found.episode) == set(range(COUNT))
     assert found.params.object_low.shape == (COUNT, 2)
+    assert found.stages.tolist() == [0] * len(found.qpos)  # a task of one stage
     assert demos.summary(found)["frames"] == len(found.qpos)
     fewer = load(recorded, count=2)
     assert fewer.episodes == 2
@@ -115,6 +118,28 @@ def test_one_seed_gives_one_file(recorded: Path, tmp_path: Path) -> None:
     for name in ("qpos", "tcp", "opening", "actions", "camera_to_world"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name), name)
     assert not np.array_equal(first.qpos[0], different.qpos[0])
+
+
+@pytest.mark.slow
+def test_stages_are_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Frame by frame, whatever else is recorded."""
+
+    class Staged(Demonstrator):
+        def __call__(self, *arguments: Any, **options: Any) -> Recording:
+            found = super().__call__(*arguments, **options)
+            time = np.arange(len(found.frames.stage))[:, None]
+            stage = np.broadcast_to(time // 10, found.frames.stage.shape)
+            return found._replace(frames=found.frames._replace(stage=stage))
+
+    monkeypatch.setattr(demos, "Demonstrator", Staged)
+    runner = worlds.runner("lift_spam")
+    path = demos.collect(runner, tmp_path / "two.hdf5", count=2, seed=4, noise=0.004)
+    found = load(path)
+    lengths = np.bincount(found.episode)
+    np.testing.assert_array_equal(
+        found.stages, np.concatenate([np.arange(length) // 10 for length in lengths])
+    )
+    assert found.stages.max() >= 2
 
 
 @pytest.mark.slow

@@ -107,6 +107,26 @@ def test_angle_curve_leaves_out_angles_without_scenes() -> None:
     np.testing.assert_allclose(line.get_ydata(), [0.5])
 
 
+def test_strength_curves_have_a_panel_for_each_shift() -> None:
+    at = np.array([-1.0, 0.0, 1.0])
+    palm = grids.Curve(at, np.array([4.0, 8, 6]), np.full(3, 8.0))
+    bc = grids.Curve(at, np.array([0.0, 8, 0]), np.array([8.0, 8, 0]))
+    figure = figures.strength_curves(
+        {"lighting": {"palm": palm, "bc": bc}, "object_color": {"palm": palm}, "fog": {}}
+    )
+    first, second = figure.axes
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["lighting", "object color"]
+    lines = {line.get_label(): line for line in first.lines}
+    np.testing.assert_allclose(lines["PALM"].get_ydata(), [0.5, 1, 0.75])
+    np.testing.assert_allclose(lines["BC"].get_ydata(), [0, 1])  # a strength without scenes
+    np.testing.assert_allclose(lines["PALM"].get_xdata(), at, atol=0.1)
+    np.testing.assert_allclose(lines["BC"].get_xdata(), at[:2], atol=0.1)
+    drawn = error_bars(second)[0]
+    np.testing.assert_allclose(drawn, scipy_wilson([4, 8, 6], [8] * 3), atol=1e-12)
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["PALM", "BC"]
+
+
 def records_of(n: int, seed: int) -> DomainRecord:
     rng = np.random.default_rng(seed)
     return DomainRecord(
@@ -115,6 +135,7 @@ def records_of(n: int, seed: int) -> DomainRecord:
         rng.uniform((0.05, -0.35), (0.45, 0.35), (n, 2)).astype(np.float32),
         rng.uniform(-0.52, 0.52, n).astype(np.float32),
         np.full(n, 9, np.int32),
+        np.ones(n, np.int32),
     )
 
 
@@ -167,6 +188,13 @@ def test_bars_intervals_and_the_papers_marks() -> None:
     np.testing.assert_allclose(marks[1].get_ydata(), [0.52, 0.182])
     assert len(marks) == 2, "a method that is not in the paper has no mark"
     assert [label.get_text() for label in axes.get_xticklabels()] == ["ID", "W+V"]
+
+
+def test_long_domain_names_are_broken_into_lines() -> None:
+    entry = {"successes": 1, "episodes": 2}
+    counts = {"palm": {"in_domain": entry, "object_color+viewpoint": entry}}
+    labels = [t.get_text() for t in figures.domain_bars(counts).axes[0].get_xticklabels()]
+    assert labels == ["ID", "object color\n+ viewpoint"]
 
 
 def test_many_methods_break_the_bars_into_two_rows() -> None:
@@ -222,6 +250,7 @@ def test_gallery_places_every_image() -> None:
     [
         lambda: figures.heatmaps({}, REGIONS),
         lambda: figures.angle_curves({}, REGIONS),
+        lambda: figures.strength_curves({"lighting": {}}),
         lambda: figures.sample_distribution({}, REGIONS),
         lambda: figures.domain_bars({"palm": {}}),
         lambda: figures.training_curves({"palm": []}),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from palm_jax.train import grids
-from palm_jax.train.records import DomainRecord, Sweep
+from palm_jax.train.records import DomainRecord, StrengthSweep, Sweep
 
 REGIONS = grids.Regions()
 
@@ -22,6 +22,7 @@ def record(
         np.array(xy, np.float32).reshape(-1, 2),
         np.radians(np.array(angles)).astype(np.float32),
         np.full(len(success), 10, np.int32),
+        np.ones(len(success), np.int32),
     )
 
 
@@ -47,7 +48,7 @@ def test_angle_bins_pool_records_and_accept_none() -> None:
 
 def test_curve_of_records_sits_at_bin_centres() -> None:
     curve = grids.curve_of_records([record([(0.2, 0.0)], [15], [1], [0])], REGIONS)
-    np.testing.assert_allclose(np.degrees(curve.angles), [-25, -15, -5, 5, 15, 25])
+    np.testing.assert_allclose(np.degrees(curve.at), [-25, -15, -5, 5, 15, 25])
     assert curve.episodes.tolist() == [0, 0, 0, 0, 1, 0]
 
 
@@ -88,7 +89,15 @@ def test_curve_of_sweep_pools_positions(sweep: Sweep) -> None:
     curve = grids.curve_of_sweep(sweep)
     assert curve.successes.tolist() == [3, 2]
     assert curve.episodes.tolist() == [24, 24]
-    np.testing.assert_allclose(np.degrees(curve.angles), [-15, 15])
+    np.testing.assert_allclose(np.degrees(curve.at), [-15, 15])
+
+
+def test_curve_of_strengths() -> None:
+    success = np.array([[1, 1, 0], [1, 0, 0]], bool)
+    nan = np.array([[0, 1, 0], [0, 0, 0]], bool)
+    curve = grids.curve_of_strengths(StrengthSweep("fog", np.array([0.0, 1]), success, nan))
+    assert curve.at.tolist() == [0, 1]
+    assert curve.successes.tolist() == [1, 1] and curve.episodes.tolist() == [3, 3]
 
 
 def test_a_sweep_of_one_cell_still_has_an_area() -> None:

@@ -72,6 +72,8 @@ def test_implied_success(method: str, expected: tuple[float, ...]) -> None:
         ("workspace+viewpoint+embodiment", "WVE"),
         ("lights", "lights"),
         ("w_lights", "w_lights"),
+        ("viewpoint_cone", "viewpoint_cone"),
+        ("workspace+object_color", "workspace+object_color"),
         ("wide", "wide"),
         ("w2", "w2"),
         ("", ""),
@@ -87,6 +89,8 @@ def test_order_and_labels() -> None:
     assert [paper.domain_label(d) for d in paper.DOMAINS] == [
         "ID", "W", "V", "E", "W+V", "W+E", "V+E", "All",
     ]  # fmt: skip
+    assert paper.domain_label("object_color+workspace") == "object color + workspace"
+    assert paper.domain_title("workspace+viewpoint+embodiment") == "all three"
     assert paper.task_label("my_task") == "my task"
     assert paper.method_label("mine") == "mine"
     assert paper.degradation("mine", "W") is None and paper.degradation("palm", "ID") is None

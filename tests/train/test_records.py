@@ -17,6 +17,7 @@ def values(n: int = 3) -> dict[str, Any]:
         "object_xy": np.arange(2.0 * n).reshape(n, 2),
         "camera_angle": np.linspace(-0.5, 0.5, n),
         "length": np.arange(n) + 10,
+        "draws": np.arange(n) + 1,
     }
 
 
@@ -63,6 +64,40 @@ def test_missing_array_is_named() -> None:
         records.domain_record(incomplete)
 
 
+def test_files_from_before_draws_were_counted_still_load(tmp_path: Path) -> None:
+    old = {f"ID/{name}": array for name, array in values(4).items() if name != "draws"}
+    np.savez(tmp_path / "eval.npz", **old)
+    loaded = records.load_eval(tmp_path / "eval.npz")["ID"]
+    assert loaded.draws.tolist() == [0] * 4 and loaded.length.tolist() == [10, 11, 12, 13]
+
+
+def test_strengths_round_trip(tmp_path: Path) -> None:
+    success = np.array([[True, False, True], [True, True, True]])
+    sweep = records.StrengthSweep("lighting", np.array([-1.0, 0.5]), success, ~success)
+    loaded = records.load_strengths(records.save_strengths(tmp_path / "s.npz", sweep))
+    assert loaded.shift == "lighting" and loaded.strengths.tolist() == [-1.0, 0.5]
+    np.testing.assert_array_equal(loaded.success, success)
+    np.testing.assert_array_equal(loaded.nan, ~success)
+    np.testing.assert_array_equal(loaded.solved, success)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"success": np.zeros((2, 3)), "nan": np.zeros((2, 3))}, r"shape \[1, S\], got \(2, 3\)"),
+        ({"nan": np.zeros((1, 2))}, r"got \(1, 3\) and \(1, 2\)"),
+        ({"shift": None}, "s.npz: missing shift"),
+    ],
+)
+def test_wrong_strengths_are_named(change: dict[str, Any], message: str, tmp_path: Path) -> None:
+    whole = {"shift": "lighting", "strengths": [0.5], "success": np.zeros((1, 3))}
+    arrays = whole | {"nan": np.zeros((1, 3))} | change
+    kept = {name: array for name, array in arrays.items() if array is not None}
+    np.savez(tmp_path / "s.npz", **kept)
+    with pytest.raises(records.RecordError, match=message):
+        records.load_strengths(tmp_path / "s.npz")
+
+
 def test_sweep_round_trip(tmp_path: Path) -> None:
     sweep = small_sweep()
     loaded = records.load_sweep(records.save_sweep(tmp_path / "sweep.npz", sweep))
@@ -86,7 +121,7 @@ def test_damaged_archives_are_named(damage: str, tmp_path: Path) -> None:
     if damage == "truncate":
         content = content[: len(content) // 2]
     elif damage == "flip":
-        content[len(content) // 3] ^= 0xFF
+        content[content.index(b"object_xy.npy") + 60] ^= 0xFF  # in the compressed numbers
     else:
         content = bytearray(b"" if damage == "empty" else b"not an archive")
     path.write_bytes(content)

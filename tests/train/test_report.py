@@ -64,6 +64,7 @@ def episodes(good: int, total: int, nan: int = 0) -> dict[str, Any]:
         "object_xy": rng.uniform((0.05, -0.35), (0.45, 0.35), (total, 2)),
         "camera_angle": rng.uniform(-0.5, 0.5, total),
         "length": np.full(total, 50),
+        "draws": np.arange(total) // (total - 1) + 1,  # the last one twice
     }
 
 
@@ -96,6 +97,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         np.ones((3, 2, 3, 2), bool), np.zeros((3, 2, 3, 2), bool),
     )  # fmt: skip
     records.save_sweep(root / "palm" / "sweep.npz", sweep)
+    records.save_sweep(root / "palm" / "sweep-ur5.npz", sweep)
+    some = np.ones((2, 5), bool)
+    curve = records.StrengthSweep("object_color", np.array([-1.0, 1.0]), some, ~some)
+    records.save_strengths(root / "bc" / "strength-object_color.npz", curve)
     y = np.arange(24, dtype=np.uint8)
     clip = [np.stack([np.add.outer(y, y + i)] * 3, -1).astype(np.uint8) for i in range(4)]
     videos.write_video(root / "videos" / "bc_workspace_viewpoint_2.mp4", clip)
@@ -132,15 +137,57 @@ def test_the_page_is_one_file_without_scripts_or_requests(content: str, read: Re
 def test_embedded_media_are_the_files(folder: Path, read: Reader) -> None:
     inside = [base64.b64decode(value.partition("base64,")[2]) for value in read.loads]
     expected = [*(folder / "figures").glob("*.png"), *folder.rglob("videos/*.mp4")]
-    assert len(expected) == len(inside) == 6 + 2
+    assert len(expected) == len(inside) == 9 + 2
     assert {file.read_bytes() for file in expected} == set(inside)
 
 
 def test_figures_made(folder: Path) -> None:
     assert {file.name for file in (folder / "figures").iterdir()} == {
         "domains.png", "samples.png", "heatmap.png", "angles.png", "training.png",
-        "policy_inputs.png",
+        "policy_inputs.png", "heatmap-ur5.png", "angles-ur5.png", "strength.png",
     }  # fmt: skip
+
+
+def test_sweeps_with_another_robot_and_over_a_strength_are_told_apart(read: Reader) -> None:
+    for text in (
+        "Success over the object's start position, from a sweep",
+        "Success with the robot ur5 over the object's start position, from a sweep",
+        "Success with the robot ur5 over the camera's rotation",
+        "Success over the strength of a shift (first seed)",
+    ):
+        assert text in read.text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_eight_domains_and_others(tmp_path: Path) -> None:
+    """The paper's order and its mean over seven; another domain has a row, and no part in it."""
+    good = {"workspace+viewpoint+embodiment": 12, "lighting": 0, "viewpoint_cone+object_color": 6}
+    good |= {"in_domain": 24, "viewpoint+embodiment": 18, "workspace+embodiment": 24}
+    good |= {"embodiment": 12, "workspace+viewpoint": 24, "viewpoint": 18, "workspace": 24}
+    write_run(tmp_path / "palm", "palm", good, robot="panda", other_robot="ur5")
+    read = Reader(report.build(tmp_path / "palm"))
+    names = [row[0] for row in read.rows]
+    assert names[2:] == [
+        "ID in-domain", "W workspace", "V viewpoint", "E embodiment", "W+V workspace + viewpoint",
+        "W+E workspace + embodiment", "V+E viewpoint + embodiment", "All all three",
+        "lighting", "viewpoint cone + object color", "OOD mean",
+    ]  # fmt: skip
+    assert read.row("lighting")[1].startswith("1.00")
+    # (0 + .25 + .5 + 0 + 0 + .25 + .5) / 7, and the last row of the paper's Table I.
+    assert read.row("OOD mean") == ["", "0.21 paper 0.08"]
+    assert "embodiment ur5" in " ".join(read.text.split())
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_start_poses_drawn_again_are_told(tmp_path: Path) -> None:
+    write_run(tmp_path / "a", "palm", {"in_domain": 24, "embodiment": 12})
+    text = " ".join(Reader(report.build(tmp_path / "a")).text.split())
+    assert "Mean number of draws: ID 1.04 (most 2), E 1.04 (most 2); 1 in other domains." in text
+    record = {**episodes(3, 24), "draws": np.ones(24)}
+    records.save_eval(tmp_path / "a" / "eval.npz", {"in_domain": record})
+    assert "Mean number of draws: 1 in every domain." in report.build(tmp_path / "a")
+    records.save_eval(tmp_path / "a" / "eval.npz", {"in_domain": {**record, "draws": np.zeros(24)}})
+    assert "number of draws" not in report.build(tmp_path / "a")
 
 
 def test_table_by_hand(read: Reader) -> None:

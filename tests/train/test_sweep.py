@@ -1,19 +1,17 @@
 """Sweeps: what is asked for, in which order it runs, and where its results end up."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+import rooms
 
-from palm_jax.envs import make, shifts
+from palm_jax.envs import make
 from palm_jax.envs.base import EnvParams
-from palm_jax.envs.rollout import Episodes
-from palm_jax.train import sweep
-from palm_jax.train.evaluate import Evaluator
-from palm_jax.train.methods import find
+from palm_jax.train import records, runs, sweep
+from palm_jax.train.sweep import SweepConfig
 
 
 @pytest.mark.parametrize(
@@ -65,49 +63,16 @@ def test_cell_params_pin_angle_and_object(default: EnvParams) -> None:
     np.testing.assert_allclose(cells.camera_angle[row], ANGLES[1])
 
 
-class Room:
-    """A runner without physics: an episode is a function of its params and its key."""
-
-    def __init__(self, worlds: int) -> None:
-        self.env, self.worlds = make("lift_spam"), worlds
-        self.batches: list[np.ndarray] = []
-
-    def run(
-        self, key: Any, keys: jax.Array, params: EnvParams, act: Any, spec: Any, **options: Any
-    ) -> Episodes:
-        del key, act, spec, options
-        assert len(keys) == len(params.object_low) == self.worlds
-        self.batches.append(np.asarray(jax.random.key_data(keys)))
-        x, y = np.asarray(params.object_low).T
-        angle = np.asarray(params.camera_angle)[:, 0]
-        flat = np.zeros(self.worlds)
-        return Episodes(
-            success=jnp.asarray((x > 0.15) & (y < 0.15) & (angle < 0)),
-            nan=jnp.asarray(y > 0.15),
-            seen=jnp.asarray(flat == 0),
-            length=jnp.asarray(flat.astype(np.int32)),
-            object_xy=jnp.asarray(np.stack([x, y], -1)),
-            object_yaw=jnp.asarray(np.asarray(params.align_hand)),
-            camera_angle=jnp.asarray(angle),
-        )
-
-
-def evaluator(worlds: int) -> tuple[Evaluator, Room]:
-    room: Any = Room(worlds)
-    learner: Any = type("Idle", (), {"jitted_act": None})()
-    return Evaluator(room, find("palm"), learner, 84), room
-
-
 POLICY: Any = None
 
 
 @pytest.mark.parametrize("worlds", [5, 48, 64])
 def test_every_result_lands_in_its_cell(worlds: int) -> None:
     """Whatever the batch: axes are angle, x, y, episode."""
-    runs, room = evaluator(worlds)
+    runner, made = rooms.evaluator(worlds)
     finished: list[int] = []
     found = sweep.sweep(
-        runs,
+        runner,
         POLICY,
         angles=ANGLES,
         xs=XS,
@@ -118,39 +83,112 @@ def test_every_result_lands_in_its_cell(worlds: int) -> None:
         progress=finished.append,
     )
     angle, x, y, _ = np.meshgrid(ANGLES, XS, YS, range(2), indexing="ij")
-    np.testing.assert_array_equal(found.success, (x > 0.15) & (y < 0.15) & (angle < 0))
+    np.testing.assert_array_equal(found.success, (x > 0.12) & (y < 0.15) & (angle < 0))
     np.testing.assert_array_equal(found.nan, y > 0.15)
-    assert sum(finished) == 48 and len(room.batches) == -(-48 // worlds)
-    keys = np.concatenate(room.batches)[:48]
+    room = made["panda"]
+    assert sum(finished) == 48 and len(room.keys) == -(-48 // worlds)
+    keys = np.concatenate(room.keys)[:48]
     assert len(np.unique(keys, axis=0)) == 48  # every episode is a scene of its own
+    assert list(made) == ["panda"]
 
 
-@pytest.mark.parametrize("count", [1, 7, 8, 9, 20])
-def test_an_evaluation_has_as_many_episodes_as_it_was_asked_for(count: int) -> None:
-    """The last batch is filled up and cut; a scene's key does not depend on the count."""
-    runs, room = evaluator(8)
-    record = runs.domain(POLICY, "workspace", seed=3, count=count, aligned=False)
-    assert record.success.shape == record.nan.shape == record.length.shape == (count,)
-    assert record.object_xy.shape == (count, 2)
-    longer, other = evaluator(8)
-    longer.domain(POLICY, "workspace", seed=3, count=24, aligned=False)
-    mine, theirs = np.concatenate(room.batches), np.concatenate(other.batches)
-    np.testing.assert_array_equal(mine, theirs[: len(mine)])
-    moved, third = evaluator(8)
-    moved.domain(POLICY, "viewpoint", seed=3, count=count, aligned=False)
-    assert (np.concatenate(third.batches) != mine).any(-1).all()  # other domain, other scenes
+@pytest.mark.parametrize("worlds", [4, 6])
+def test_every_strength_sees_the_same_scenes(worlds: int) -> None:
+    """The camera's bounds grow with the strength; the scenes' keys are those of the seed."""
+    runner, made = rooms.evaluator(worlds)
+    finished: list[int] = []
+    strengths = np.array([0.0, 0.5, 1.0])
+    found = sweep.sweep_strength(
+        runner,
+        POLICY,
+        shift="viewpoint",
+        strengths=strengths,
+        episodes=6,
+        seed=3,
+        aligned=True,
+        progress=finished.append,
+    )
+    assert found.shift == "viewpoint" and finished == [6, 6, 6]
+    np.testing.assert_array_equal(found.strengths, strengths)
+    # In this room success needs a negative lower bound, and an object in the training region.
+    np.testing.assert_array_equal(found.success, (strengths > 0)[:, None] & np.ones((3, 6), bool))
+    room = made["panda"]
+    batches = -(-6 // worlds)
+    for row, strength in enumerate(strengths):
+        batch = slice(row * batches, (row + 1) * batches)
+        keys = np.concatenate(room.keys[batch])
+        np.testing.assert_array_equal(keys, np.concatenate(room.keys[:batches]))
+        for params in room.params[batch]:
+            low = np.degrees(np.asarray(params.camera_angle))
+            np.testing.assert_allclose(low, np.tile([[-30, 30]], (worlds, 1)) * strength, atol=1e-4)
+            assert (np.asarray(params.align_hand) == 1).all()
 
 
-@pytest.mark.parametrize("aligned", [False, True])
-def test_the_hand_follows_the_camera_only_where_it_is_asked_to(aligned: bool) -> None:
-    runs, room = evaluator(4)
-    seen: list[float] = []
-    inner = room.run
+def test_jobs_have_the_size_of_what_was_asked_for() -> None:
+    grid = sweep.job(SweepConfig(run=Path(), camera="-30:30:3", workspace="2x5", batch=16))
+    assert (grid.worlds, grid.episodes) == (16, 30)
+    curve = sweep.job(SweepConfig(run=Path(), shift="lighting"))
+    # No more worlds than there are scenes at a strength.
+    assert (curve.worlds, curve.episodes) == (24, 5 * 24)
+    few = sweep.job(SweepConfig(run=Path(), shift="lighting", strength="0.5", episodes=200))
+    assert (few.worlds, few.episodes) == (64, 200)
 
-    def spy(key: Any, keys: Any, params: EnvParams, *rest: Any, **options: Any) -> Episodes:
-        seen.extend(np.asarray(params.align_hand).tolist())
-        return inner(key, keys, params, *rest, **options)
 
-    room.run = spy  # type: ignore[method-assign]
-    runs.domain(POLICY, shifts.DOMAINS[-1], seed=0, count=4, aligned=aligned)
-    assert set(seen) == {float(aligned)}
+@pytest.mark.parametrize(
+    ("shift", "strengths"),
+    [("lighting", [-1, -0.5, 0, 0.5, 1]), ("workspace", [0, 0.25, 0.5, 0.75, 1]),
+     ("lighting+viewpoint", [0, 0.25, 0.5, 0.75, 1])],
+)  # fmt: skip
+def test_the_whole_range_of_a_shift(shift: str, strengths: list[float]) -> None:
+    found = sweep.strengths_of(sweep.default_strengths(shift))
+    np.testing.assert_allclose(found, strengths)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"shift": "light"}, "unknown shift 'light'.*known: .*lighting"),
+        ({"shift": "embodiment"}, "expected shifts with a strength, got 'embodiment'.*--robot"),
+        ({"shift": "in_domain"}, "expected shifts with a strength, got 'in_domain'"),
+        ({"shift": "lighting", "strength": "0:1"}, "strength: expected LOW:HIGH:COUNT.*'0:1'"),
+        ({"camera": "left"}, "camera: expected LOW:HIGH:COUNT in degrees.*'left'"),
+    ],
+)
+def test_jobs_that_are_none(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        sweep.job(SweepConfig(run=Path(), **options))
+
+
+def test_files_are_named_after_robot_and_shift(tmp_path: Path) -> None:
+    """And found again by what reads a run folder."""
+    cells = np.zeros((1, 1, 1, 2), bool)
+    grid = records.Sweep(np.zeros(1), np.zeros(1), np.zeros(1), cells, cells)
+    names = []
+    for robot in ("", "ur5"):
+        path = records.save_sweep(records.sweep_path(tmp_path, robot), grid)
+        names.append(path.name)
+        for shift in ("lighting", "object_color+viewpoint"):
+            curve = records.StrengthSweep(
+                shift, np.array([0.0, 1]), np.ones((2, 3), bool), np.zeros((2, 3), bool)
+            )
+            path = records.sweep_path(tmp_path, robot, shift=shift)
+            assert records.swept_robot(records.save_strengths(path, curve)) == robot
+            names.append(path.name)
+    assert names == [
+        "sweep.npz", "strength-lighting.npz", "strength-object_color+viewpoint.npz",
+        "sweep-ur5.npz", "strength-lighting-ur5.npz", "strength-object_color+viewpoint-ur5.npz",
+    ]  # fmt: skip
+    run = runs.load_run(tmp_path)
+    assert not run.problems and set(run.sweeps) == {"", "ur5"}
+    both = ("lighting", "object_color+viewpoint")
+    assert set(run.strengths) == {(robot, shift) for robot in ("", "ur5") for shift in both}
+
+
+def test_wrong_sweep_commands_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words, message in (
+        ([str(tmp_path)], "no run folder here"),
+        ([str(tmp_path), "--robot", "r2d2"], "unknown robot 'r2d2'; known: panda"),
+        ([str(tmp_path), "--shift", "fog"], "unknown shift 'fog'"),
+    ):
+        assert sweep.main(words) == 2
+        assert message in " ".join(capsys.readouterr().out.split())
