@@ -57,7 +57,7 @@ class Replay:
             state = self._judge(state, jnp.asarray(ctrl), last, now)
             jumped = np.asarray(state.jump)
             if jumped.any():
-                state = runner.relocate(state, params)
+                state = runner.jump(state, params)
                 for world in np.flatnonzero(jumped):
                     _write(worlds[world], state, world)
             found.append(
