@@ -1,4 +1,4 @@
-"""The environment: `Env`, its shiftable parameters `EnvParams` and its `State`.
+"""The environment: `Env` and its `State`; what can shift is in `palm_jax.envs.params`.
 
 An episode: objects are placed in a region, a global policy finds the target in a rendered mask and
 the hand is put near it (`reset`), then a local policy moves the TCP by body-frame deltas (`step`).
@@ -27,6 +27,10 @@ from palm_jax.align import (
     window_origin,
 )
 from palm_jax.envs import control, physics
+from palm_jax.envs.calibration import miscalibrated
+from palm_jax.envs.distractors import Distractors
+from palm_jax.envs.params import TEST_HIGH, TEST_LOW
+from palm_jax.envs.params import EnvParams as EnvParams
 from palm_jax.envs.robots import Robot
 from palm_jax.envs.scene import SceneModel
 from palm_jax.envs.tasks import TABLE_HEIGHT, WORKSPACE_CENTRE, Task
@@ -41,36 +45,14 @@ WIDE_FRAME = 1024
 
 _LOCATE_SIZE = 128  # the mask for the global policy: the wide frame at an eighth
 _SUBSTEPS = 10
+_AREA_MARGIN = 0.12  # other objects may stand this far outside the target's region, metres
 _MAX_DRAWS = 16  # start poses drawn before an episode is declared impossible
 _IN_REACH = 0.002  # metres and radians that a start pose may be off
 _STILL_SEEN = 0.7  # share of a target's mask below which its earlier sighting is trusted more
-_LAYOUT, _LATER = 1, 2  # folded into a scene's key: the other objects, the later stages
+# Folded into a scene's key, so that one more draw leaves those that were there before unchanged.
+_RADIUS_DRAW, _DISTRACTOR_DRAW, _LAYOUT_DRAW, _LATER_DRAW = range(1, 5)
 CONTROL_RATE = 20.0
 """Control steps a second."""
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class EnvParams:
-    """What can shift. Every field is a leaf (arrays without a batch axis; `vmap` for more)."""
-
-    camera_to_world: jax.Array  # [4, 4] nominal camera pose (OpenCV axes)
-    camera_fovy: jax.Array  # [] degrees, of the 512-pixel frame
-    camera_angle: jax.Array  # [2] range of the camera's turn about the workspace centre, radians
-    object_low: jax.Array  # [2] lower xy corner of the target object's region, metres
-    object_high: jax.Array  # [2] upper corner
-    object_yaw: jax.Array  # [2] range of the object's yaw in the world, radians
-    area_low: jax.Array  # [2] lower xy corner of where the other objects may stand, metres
-    area_high: jax.Array  # [2] upper corner
-    start_radius: jax.Array  # [] the hand starts this near the located target, per axis, metres
-    start_height: jax.Array  # [S, 2] TCP's height above the table as each stage begins, metres
-    start_yaw: jax.Array  # [2] range of the hand's yaw, radians
-    align_hand: jax.Array  # [] 1: the hand's initial yaw turns with the camera, 0: it does not
-    light_ambient: jax.Array  # [3]
-    light_diffuse: jax.Array  # [L, 3]
-    light_direction: jax.Array  # [L, 3] direction the light travels in
-    geom_rgb: jax.Array  # [R, 3] colours of the rendered geoms, 0..1
-    robot_visible: jax.Array  # [] 1: drawn, 0: hidden in rendering (physics unchanged)
 
 
 @jax.tree_util.register_dataclass
@@ -142,6 +124,7 @@ class Env:
         self.mjx_model = mjx.put_model(self.mj_model)
         self.scene_model = SceneModel(self.mj_model)
         self.chain = control.arm_chain(self.mj_model, robot)
+        self._distractors = Distractors(self.mj_model)
         self._ids = task.bind(self.mj_model, robot)
         self._tcp_site = self.mj_model.site("tcp").id
         self._arm_qpos = self._addresses(robot.arm_joints)
@@ -165,16 +148,21 @@ class Env:
     def default_params(self) -> EnvParams:
         """The training distribution: the paper's front camera, objects within 0.2 x 0.2 m."""
         centre = np.asarray(WORKSPACE_CENTRE[:2])
-        lights = self.scene_model.lights
+        lights, table = self.scene_model.lights, self.scene_model.table
         values = {
             "camera_to_world": front_camera(),
             "camera_fovy": 40.0,
             "camera_angle": (0.0, 0.0),
+            "camera_radius": (1.0, 1.0),
+            "calibration_pixels": np.zeros(2),
+            "calibration_rotation": np.zeros(3),
+            "calibration_translation": np.zeros(3),
             "object_low": centre - 0.1,
             "object_high": centre + 0.1,
             "object_yaw": (-0.5, 0.5),
-            "area_low": (0.05, -0.22),
-            "area_high": (0.45, 0.22),
+            "area_low": np.maximum(centre - 0.1 - _AREA_MARGIN, TEST_LOW),
+            "area_high": np.minimum(centre + 0.1 + _AREA_MARGIN, TEST_HIGH),
+            "distractors": 0.0,
             "start_radius": 0.06,
             "start_height": [stage.start_height for stage in self.task.stages],
             "start_yaw": (-0.5, 0.5),
@@ -183,6 +171,10 @@ class Env:
             "light_diffuse": lights.diffuse,
             "light_direction": lights.direction,
             "geom_rgb": self.scene_model.rgb,
+            "object_hue": 0.0,
+            "table_rgb": table.rgb,
+            "table_rgb2": table.rgb2,
+            "table_scale": table.scale,
             "robot_visible": float(self.task.robot_visible),
         }
         return EnvParams(**{k: jnp.asarray(v, jnp.float32) for k, v in values.items()})
@@ -201,20 +193,29 @@ class Env:
         xy = jax.random.uniform(xy_key, (2,), minval=params.object_low, maxval=params.object_high)
         yaw = _uniform(yaw_key, params.object_yaw)
         angle = _uniform(camera_key, params.camera_angle)
+        radius = _uniform(jax.random.fold_in(key, _RADIUS_DRAW), params.camera_radius)
         area = jnp.stack([params.area_low, params.area_high])
         placement = self.task.place(
-            self._ids, jax.random.fold_in(key, _LAYOUT), self._home_qpos(), xy, yaw, area
+            self._ids, jax.random.fold_in(key, _LAYOUT_DRAW), self._home_qpos(), xy, yaw, area
         )
+        parked = self._distractors.parked()
         data = mjx.make_data(self.mjx_model).replace(
             qpos=placement.qpos,
             ctrl=self._servo_targets(jnp.asarray(self.chain.home), jnp.ones(())),
-            mocap_pos=placement.mocap_pos,
-            mocap_quat=placement.mocap_quat,
+            mocap_pos=jnp.concatenate([parked.pos, placement.mocap_pos]),
+            mocap_quat=jnp.concatenate([parked.quat, placement.mocap_quat]),
         )
         data = mjx.kinematics(self.mjx_model, data)
-        camera = Camera.from_fovy(
-            params.camera_fovy, PAPER_FRAME, PAPER_FRAME, params.camera_to_world
+        arranged = self._distractors.arrange(
+            jax.random.fold_in(key, _DISTRACTOR_DRAW), params, data, xy
         )
+        data = data.replace(
+            mocap_pos=data.mocap_pos.at[: len(arranged.pos)].set(arranged.pos),
+            mocap_quat=data.mocap_quat.at[: len(arranged.quat)].set(arranged.quat),
+        )
+        data = mjx.kinematics(self.mjx_model, data)
+        pose = _at_distance(params.camera_to_world, radius)
+        camera = Camera.from_fovy(params.camera_fovy, PAPER_FRAME, PAPER_FRAME, pose)
         turned = camera.rotated_about(jnp.asarray(WORKSPACE_CENTRE), angle)
         return State(
             data=data,
@@ -222,7 +223,7 @@ class Env:
             camera_angle=angle,
             object_start=self.task.object_position(self._ids, data),
             object_yaw=yaw,
-            key=jax.random.key_data(jax.random.fold_in(key, _LATER)),
+            key=jax.random.key_data(jax.random.fold_in(key, _LATER_DRAW)),
             stage=jnp.zeros((), jnp.int32),
             jump=jnp.zeros((), bool),
             targets=jnp.tile(jnp.asarray(WORKSPACE_CENTRE[:2]), (len(self.task.stages), 1)),
@@ -266,13 +267,14 @@ class Env:
         one that has never been in view leaves the workspace centre and `seen = False`.
         """
         camera = self.camera(state, params, frame=WIDE_FRAME).scaled(_LOCATE_SIZE / WIDE_FRAME)
+        believed = self.calibrated_camera(state, params).scaled(_LOCATE_SIZE / WIDE_FRAME)
         frame = render(self.scene(state, params), camera, outputs=("segmentation",))
         assert frame.segmentation is not None
         found = [
             _centroid(jnp.isin(frame.segmentation, jnp.asarray(ids))) for ids in self._target_ids
         ]
         uv, count = (jnp.stack(values) for values in zip(*found, strict=True))
-        xy = jax.vmap(lambda uv, z: unproject_to_height(camera, uv, z)[:2])(
+        xy = jax.vmap(lambda uv, z: unproject_to_height(believed, uv, z)[:2])(
             uv, jnp.asarray(self._target_heights)
         )
         clear = (count > 0) & (count >= _STILL_SEEN * state.pixels)
@@ -470,17 +472,25 @@ class Env:
         shift = (frame - PAPER_FRAME) / 2
         return Camera(paper.K + shift * centre, state.camera_to_world, frame, frame)
 
+    def calibrated_camera(
+        self, state: State, params: EnvParams, *, frame: int = WIDE_FRAME
+    ) -> Camera:
+        """The camera that policies believe in: `camera` with the params' calibration error.
+
+        Pixels are the true camera's. Which of them are the crop, where the overlay goes, what the
+        proprioception says and where the target is located follow from this one.
+        """
+        return miscalibrated(
+            self.camera(state, params, frame=frame),
+            params.calibration_pixels,
+            params.calibration_rotation,
+            params.calibration_translation,
+        )
+
     def scene(self, state: State, params: EnvParams) -> Any:
         """The world as the renderer's `Scene`."""
-        return self.scene_model(
-            state.data.geom_xpos,
-            state.data.geom_xmat.reshape(-1, 3, 3),
-            rgb=params.geom_rgb,
-            robot_visible=params.robot_visible,
-            ambient=params.light_ambient,
-            diffuse=params.light_diffuse,
-            direction=params.light_direction,
-        )
+        xmat = state.data.geom_xmat.reshape(-1, 3, 3)
+        return self.scene_model(state.data.geom_xpos, xmat, params)
 
     def observe(
         self, state: State, params: EnvParams, spec: AlignSpec, *, frame: int = WIDE_FRAME
@@ -491,16 +501,17 @@ class Env:
         the side of the virtual full image that a `border="shift"` window must stay inside.
         """
         view, origin = self._window(state, params, spec, frame)
+        true_view = spec.view_camera(self.camera(state, params, frame=frame))
         window = Window(origin, spec.size, spec.size)
-        image = render(self.scene(state, params), view, window).rgb
+        image = render(self.scene(state, params), true_view, window).rgb
         assert image is not None
         return align_window(image, view, origin, self.tcp(state), self.opening(state), spec)
 
     def window_camera(
         self, state: State, params: EnvParams, spec: AlignSpec, *, frame: int = WIDE_FRAME
     ) -> Camera:
-        """The camera of the image that `observe` gives: K [3, 3] in pixels of the size x size
-        window, cam_to_world [4, 4] in metres."""
+        """The calibrated camera of the image that `observe` gives: K [3, 3] in pixels of the
+        size x size window, cam_to_world [4, 4] in metres."""
         view, origin = self._window(state, params, spec, frame)
         return view.cropped(origin[::-1].astype(jnp.float32), spec.size, spec.size)
 
@@ -514,9 +525,9 @@ class Env:
     def _window(
         self, state: State, params: EnvParams, spec: AlignSpec, frame: int
     ) -> tuple[Camera, jax.Array]:
-        """The frame at the policy's resolution, and the origin int32 [2] (row, col) of its window
-        in it, pixels."""
-        view = spec.view_camera(self.camera(state, params, frame=frame))
+        """The frame at the policy's resolution as the calibrated camera has it, and the origin
+        int32 [2] (row, col) of the policy's window in it, pixels."""
+        view = spec.view_camera(self.calibrated_camera(state, params, frame=frame))
         return view, window_origin(view, self.tcp(state), spec)[0]
 
     def _home_qpos(self) -> jax.Array:
@@ -532,6 +543,13 @@ class Env:
     def _servo_targets(self, arm: jax.Array, opening: jax.Array) -> jax.Array:
         fingers = self._closed + opening * (self._open - self._closed)
         return jnp.concatenate([arm, fingers])
+
+
+def _at_distance(pose: jax.Array, factor: jax.Array) -> jax.Array:
+    """Camera pose [4, 4] at `factor` [] times its distance from the workspace centre."""
+    # As a sum, so that a factor of one changes no bit.
+    off = pose[:3, 3] - jnp.asarray(WORKSPACE_CENTRE)
+    return pose.at[:3, 3].add((factor - 1.0) * off)
 
 
 def front_camera() -> np.ndarray:

@@ -190,7 +190,7 @@ def step_towards(
     """
     error = gain * pose_error(tcp, target)
     move, turn = _saturate(error[:3], max_distance), _saturate(error[3:], max_angle)
-    rotation = _rotation_matrix(turn) @ tcp[:3, :3]
+    rotation = rotation_matrix(turn) @ tcp[:3, :3]
     return jnp.eye(4).at[:3, :3].set(rotation).at[:3, 3].set(tcp[:3, 3] + move)
 
 
@@ -198,7 +198,7 @@ def _saturate(vector: jax.Array, limit: float) -> jax.Array:
     return vector * jnp.minimum(1.0, limit / jnp.maximum(jnp.linalg.norm(vector), 1e-9))
 
 
-def _rotation_matrix(vector: jax.Array) -> jax.Array:
+def rotation_matrix(vector: jax.Array) -> jax.Array:
     """Rotation [3, 3] about `vector` [3] by its length (Rodrigues)."""
     angle = jnp.linalg.norm(vector)
     x, y, z = vector / jnp.maximum(angle, 1e-9)

@@ -16,6 +16,10 @@ import numpy as np
 from palm_jax.align import Aligned, AlignSpec
 from palm_jax.envs import physics
 from palm_jax.envs.base import WIDE_FRAME, Env, EnvParams, State
+from palm_jax.envs.params import ParamsError as ParamsError
+from palm_jax.envs.params import check_params
+from palm_jax.envs.params import repeat_params as repeat_params
+from palm_jax.envs.params import take_params as take_params
 
 Act = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
 """Policy of a batch: (key, images [B, H, W, 3] uint8, proprio [B, P]) -> actions [B, 10]."""
@@ -126,8 +130,11 @@ class Runner:
         """`Env.reset` of W worlds, in three compiled pieces.
 
         Raises:
+          ParamsError: params that contradict themselves, see `check_params`.
           StartPoseError: no start pose within the arm's reach was found for some world.
         """
+        if isinstance(params, EnvParams):  # environments of other kinds bring their own
+            check_params(params)
         keys = jax.vmap(jax.random.split)(keys)
         state = self._place(keys[:, 0], params)
         state = self._reposition(keys[:, 1], self._locate(state, params), params)
@@ -234,13 +241,3 @@ def scan_episodes(
     length = jnp.full(keys.shape[0], horizon, jnp.int32)
     (state, length), _ = jax.lax.scan(advance, (start, length), jnp.arange(horizon))
     return _outcome(state, length)
-
-
-def repeat_params(params: EnvParams, count: int) -> EnvParams:
-    """`params` of one world with a leading axis [count]."""
-    return jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), params)
-
-
-def take_params(params: EnvParams, rows: np.ndarray) -> EnvParams:
-    """The worlds `rows` [n] of params with a leading axis."""
-    return jax.tree.map(lambda leaf: leaf[rows], params)

@@ -12,6 +12,10 @@ import mujoco
 
 from palm_jax.envs.robots import Robot
 
+DISTRACTORS = ("distractor_mug", "distractor_block", "distractor_ball", "distractor_dumbbell")
+"""Bodies of `assets/table.xml` that no task is about: drawn where an episode puts them, touched by
+nothing. They are the first mocap bodies of every model, in this order."""
+
 
 class Contact(NamedTuple):
     """Two geoms that may touch.

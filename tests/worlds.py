@@ -20,11 +20,18 @@ SPEC = AlignSpec(crop=200, offset=(0, 40), size=84)
 
 TASKS = ("lift_spam", "lift_lid")
 
+CASES = (("lift_spam", "panda"), ("lift_lid", "panda"), ("lift_spam", "ur5"))
+"""Tasks and robots whose experts are looked at."""
+
+
+def runner(task: str, robot: str = "panda") -> Runner:
+    """The one runner of a task on a robot."""
+    return _runner(task, robot)
+
 
 @functools.cache
-def runner(task: str) -> Runner:
-    """The one runner of a task."""
-    return Runner(make(task), WORLDS)
+def _runner(task: str, robot: str) -> Runner:
+    return Runner(make(task, robot), WORLDS)
 
 
 def params(env: Env, domain: str = "in_domain") -> EnvParams:
@@ -41,13 +48,17 @@ def stack(trees: list[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trees)
 
 
-@functools.cache
-def expert_episodes(task: str, batches: int = 3) -> tuple[State, ...]:
+def expert_episodes(task: str, robot: str = "panda") -> tuple[State, ...]:
     """The expert without noise in the test region: for each batch the states [T, W, ...].
 
     An episode goes on after its success until all of its batch have ended.
     """
-    one = runner(task)
+    return _expert_episodes(task, robot, batches=3)
+
+
+@functools.cache
+def _expert_episodes(task: str, robot: str, batches: int) -> tuple[State, ...]:
+    one = runner(task, robot)
     episodes = []
     for seed in range(batches):
         p = params(one.env, "workspace")

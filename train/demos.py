@@ -25,7 +25,8 @@ from palm_jax.envs.expert import Demonstrator, Recording
 from palm_jax.envs.rollout import Runner, repeat_params, take_params
 
 FORMAT = "palm_jax-demos"
-VERSION = 1
+VERSION = 2
+"""2: mocap poses begin with the distractors', and `env_params` has all that can shift now."""
 
 
 class DemoFileError(ValueError):
@@ -207,7 +208,8 @@ def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None
         found = data.attrs.get(name)
         found = found.item() if isinstance(found, np.generic) else found  # readable in a message
         if found != value:
-            raise DemoFileError(f"{path}: expected {name} {value!r}, found {found!r}")
+            advice = "; move it away and collect again" if name == "version" else ""
+            raise DemoFileError(f"{path}: expected {name} {value!r}, found {found!r}{advice}")
     demos = [data[f"demo_{i}"] for i in range(len(data))]
     if count is not None:
         if len(demos) < count:

@@ -2,7 +2,8 @@
 
 from palm_jax.envs.robots.base import Robot
 from palm_jax.envs.robots.panda import PANDA
+from palm_jax.envs.robots.ur5 import UR5
 
-ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (PANDA,)}
+ROBOTS: dict[str, Robot] = {robot.name: robot for robot in (PANDA, UR5)}
 
 __all__ = ["ROBOTS", "Robot"]

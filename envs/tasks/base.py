@@ -22,8 +22,8 @@ class Placement(NamedTuple):
     """Where an episode puts a task's objects."""
 
     qpos: jax.Array  # [nq] the model's joint positions, with the objects' entries set
-    mocap_pos: jax.Array  # [nmocap, 3]
-    mocap_quat: jax.Array  # [nmocap, 4]
+    mocap_pos: jax.Array  # [m, 3] of the task's own mocap bodies (the distractors come before)
+    mocap_quat: jax.Array  # [m, 4]
 
 
 @dataclasses.dataclass(frozen=True)

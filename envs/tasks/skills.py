@@ -23,6 +23,7 @@ _FUNNEL_ANGLE = 0.06
 # The lift begins slowly: fingers that have yet to close fully do not slide off.
 _LIFT_SPEED = 0.004  # metres of the first control step
 _LIFT_GAIN = 0.3  # metres a step, per metre risen
+_HOLDING_MARGIN = 0.08  # of opening, above the width of the object: from there on the lift begins
 _LIFT_MARGIN = 0.03  # the expert heads for a point this far beyond the height that counts as solved
 _FUNNEL_SLOPE = 3.0  # metres of extra height per metre of lateral error
 _FUNNEL_SLOPE_ANGLE = 0.08  # metres of extra height per radian of yaw error
@@ -40,7 +41,7 @@ class Hold(NamedTuple):
 
 def hold(robot: Robot, width: float) -> Hold:
     """For an object `width` metres wide between the pads."""
-    return Hold(closing=0.95, holding=width / robot.max_width + 0.08)
+    return Hold(closing=0.95, holding=width / robot.max_width + _HOLDING_MARGIN)
 
 
 def pick(

@@ -1,4 +1,4 @@
-"""The arm: golden poses, C MuJoCo's kinematics, and how well commanded deltas are reached."""
+"""The arms: golden poses, C MuJoCo's kinematics, and how well commanded deltas are reached."""
 
 import json
 
@@ -10,20 +10,22 @@ import pytest
 import worlds
 from oracles import GOLDEN, pose
 
-from palm_jax.envs import control, make
+from palm_jax.envs import ROBOTS, control, make
 from palm_jax.envs.base import Env
 
 TABLE = 0.752
+TCP_DISTANCE = {"panda": 0.1034, "ur5": 0.145}
+"""From the flange to the TCP, metres."""
 
 
-@pytest.fixture(scope="module")
-def env() -> Env:
-    return make("lift_spam")
+@pytest.fixture(scope="module", params=ROBOTS)
+def env(request: pytest.FixtureRequest) -> Env:
+    return make("lift_spam", request.param)
 
 
 @pytest.fixture(scope="module")
 def joints(env: Env) -> np.ndarray:
-    """[32, 7] joint positions inside the limits."""
+    """[32, J] joint positions inside the limits."""
     low, high = env.chain.limits.T
     return np.random.default_rng(0).uniform(low, high, (32, len(low))).astype(np.float32)
 
@@ -45,11 +47,12 @@ def site_pose(data: mujoco.MjData, name: str) -> np.ndarray:
     return pose(data.site(name).xmat.reshape(3, 3), data.site(name).xpos)
 
 
-def golden_panda() -> list[dict]:
-    return json.loads((GOLDEN / "fk.json").read_text())["panda"]
+def golden(robot: str) -> list[dict]:
+    return json.loads((GOLDEN / "fk.json").read_text())[robot]
 
 
-@pytest.mark.parametrize("row", golden_panda())
+@pytest.mark.parametrize("env", ["panda"], indirect=True)
+@pytest.mark.parametrize("row", golden("panda"))
 def test_panda_matches_an_independent_urdf(env: Env, row: dict) -> None:
     """Last link, flange and TCP: 0.107 m along z, a turn of -45 degrees, 0.1034 m further."""
     # The golden angles lie a little beyond the limits in places; kinematics know none.
@@ -65,6 +68,28 @@ def test_panda_matches_an_independent_urdf(env: Env, row: dict) -> None:
     np.testing.assert_allclose(np.linalg.inv(base) @ site_pose(data, "tcp"), tcp, atol=2e-6)
     ours = control.forward_kinematics(env.chain, jnp.array(row["q"], jnp.float32)).tcp
     np.testing.assert_allclose(ours, base @ tcp, atol=5e-6)
+
+
+@pytest.mark.parametrize("env", ["ur5"], indirect=True)
+@pytest.mark.parametrize("row", golden("ur5"))
+def test_ur5_matches_an_independent_urdf(env: Env, row: dict) -> None:
+    """Last link and flange: 0.0823 m along the link's y, which is the flange's z.
+
+    The TCP is 0.145 m further, the hand turned by -90 degrees about z.
+    """
+    data = with_arm(env, np.array(row["q"]))
+    base = body_pose(data, "robot_base")
+    link = pose(np.array(row["rot"]), np.array(row["pos"]))
+    to_flange = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    flange = link @ pose(to_flange, np.array([0, 0.0823, 0]))
+    tcp = flange @ pose(np.array([[0, 1.0, 0], [-1, 0, 0], [0, 0, 1]]), np.array([0, 0, 0.145]))
+    # Our link frame has the joint's axis as its z.
+    ours = np.linalg.inv(base) @ body_pose(data, "wrist_3_link")
+    np.testing.assert_allclose(ours, link @ pose(to_flange, np.zeros(3)), atol=2e-6)
+    np.testing.assert_allclose(np.linalg.inv(base) @ site_pose(data, "flange"), flange, atol=2e-6)
+    np.testing.assert_allclose(np.linalg.inv(base) @ site_pose(data, "tcp"), tcp, atol=2e-6)
+    chain = control.forward_kinematics(env.chain, jnp.array(row["q"], jnp.float32)).tcp
+    np.testing.assert_allclose(chain, base @ tcp, atol=5e-6)
 
 
 def test_kinematics_and_jacobian_are_mujocos(env: Env, joints: np.ndarray) -> None:
@@ -98,12 +123,36 @@ def test_tcp_frame_is_between_the_pads(env: Env, joints: np.ndarray) -> None:
         half = env.mj_model.geom(env.robot.pads[0]).size[2]
         assert abs(middle[2]) < half
         wrist = data.site("flange").xpos
-        np.testing.assert_allclose(tcp[:3, :3].T @ (tcp[:3, 3] - wrist), [0, 0, 0.1034], atol=1e-9)
+        ahead = [0, 0, TCP_DISTANCE[env.robot.name]]
+        np.testing.assert_allclose(tcp[:3, :3].T @ (tcp[:3, 3] - wrist), ahead, atol=1e-9)
+
+
+def test_all_hands_hold_alike() -> None:
+    """Pads and tips have the same size and the same place at the TCP; open, they are as far apart
+    as the robot says. A policy that knows one hand meets no other grasp with the next."""
+    seen = []
+    for robot in ROBOTS.values():
+        env = make("lift_spam", robot.name)
+        data = mujoco.MjData(env.mj_model)
+        mujoco.mj_kinematics(env.mj_model, data)  # all joints at 0: the gripper is closed
+        tcp = site_pose(data, "tcp")
+        for name in (*robot.pads, *robot.tips):
+            place = tcp[:3, :3].T @ (data.geom(name).xpos - tcp[:3, 3])
+            seen.append(np.concatenate([place, env.mj_model.geom(name).size]))
+        width = np.subtract(robot.gripper_open, robot.gripper_closed).sum()
+        np.testing.assert_allclose(width, robot.max_width, atol=1e-12)
+    hands = np.reshape(seen, (len(ROBOTS), -1))
+    np.testing.assert_allclose(hands, hands[:1].repeat(len(hands), 0), atol=1e-9)
 
 
 def test_home_points_down_with_the_hand_along_x(env: Env) -> None:
-    tcp = site_pose(with_arm(env, np.array(env.robot.home)), "tcp")
+    """And high enough: the front camera sees all of the table's test region below the hand."""
+    data = with_arm(env, np.array(env.robot.home))
+    tcp = site_pose(data, "tcp")
     np.testing.assert_allclose(tcp[:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-9)
+    eye, farthest = np.array([1.35, 0, 1.58]), np.array([0.05, 0, TABLE + 0.1])
+    share = (eye[0] - tcp[0, 3]) / (eye[0] - farthest[0])
+    assert tcp[2, 3] - 0.01 > (eye + share * (farthest - eye))[2] + 0.05
 
 
 @pytest.fixture(scope="module")
@@ -116,13 +165,30 @@ def region(env: Env) -> np.ndarray:
     return np.asarray(jax.vmap(control.pointing_down)(positions, yaws))
 
 
-def test_reach_finds_every_pose_of_the_region(env: Env, region: np.ndarray) -> None:
-    """Start poses are exact: C MuJoCo's TCP is within 0.1 mm and 0.02 degrees of what was asked."""
+@pytest.fixture(scope="module")
+def reached(env: Env, region: np.ndarray) -> np.ndarray:
+    """[W, J] joint positions that `control.reach` finds for the poses of the region."""
     reach = jax.jit(jax.vmap(lambda target: control.reach(env.chain, env.chain.home, target)))
-    for q, target in zip(np.asarray(reach(region)), region, strict=True):
+    return np.asarray(reach(region))
+
+
+def test_reach_finds_every_pose_of_the_region(
+    env: Env, region: np.ndarray, reached: np.ndarray
+) -> None:
+    """Start poses are exact: C MuJoCo's TCP is within 0.1 mm and 0.02 degrees of what was asked."""
+    for q, target in zip(reached, region, strict=True):
         found = site_pose(with_arm(env, q), "tcp")
         np.testing.assert_allclose(found[:3, 3], target[:3, 3], atol=1e-4)
         np.testing.assert_allclose(found[:3, :3], target[:3, :3], atol=4e-4)
+
+
+def test_the_arm_stays_above_the_table(env: Env, reached: np.ndarray) -> None:
+    """The elbow is up: every joint is 0.2 m above the table, if it ever is, wherever the hand."""
+    links = [int(env.mj_model.joint(name).bodyid[0]) for name in env.robot.arm_joints]
+    home = with_arm(env, np.array(env.robot.home)).xpos[links, 2]
+    for q in reached:
+        heights = with_arm(env, q).xpos[links, 2]
+        assert (heights > np.minimum(home, TABLE + 0.2) - 1e-6).all(), heights - TABLE
 
 
 def deltas(count: int) -> np.ndarray:
@@ -150,23 +216,23 @@ def remaining(target: np.ndarray, pose: np.ndarray) -> tuple[float, float]:
 
 
 @pytest.mark.slow
-def test_a_commanded_delta_is_reached_within_one_step(region: np.ndarray) -> None:
+def test_a_commanded_delta_is_reached_within_one_step(
+    env: Env, region: np.ndarray, reached: np.ndarray
+) -> None:
     """From rest, anywhere in the region: joint targets are exact, the servos cover most of the way.
 
     Measured over 64 poses: inverse kinematics leaves well under 1 % of the way. In the 50 ms of one
     step the servos, starting at rest, cover 96 % of it (median; 94 % in the worst tenth). The
     next command starts from the measured pose, so that the rest is not lost.
     """
-    runner = worlds.runner("lift_spam")
-    env = runner.env
+    runner = worlds.runner("lift_spam", env.robot.name)
     params, actions = worlds.params(env), deltas(len(region))
-    reach = jax.jit(jax.vmap(lambda target: control.reach(env.chain, env.chain.home, target)))
     solved, covered, turned = [], [], []
     for first in range(0, len(region), worlds.WORLDS):
         rows = slice(first, first + worlds.WORLDS)
         state = runner.reset(worlds.keys(first), params)
         qpos = np.array(state.data.qpos)
-        qpos[:, env._arm_qpos] = reach(region[rows])
+        qpos[:, env._arm_qpos] = reached[rows]
         qpos[:, env._ids.qpos : env._ids.qpos + 2] = (-0.8, 0.6)  # the can is out of the way
         state = runner.restore(
             jnp.asarray(qpos),
@@ -212,15 +278,17 @@ def test_speed_limit_of_the_expert() -> None:
     np.testing.assert_allclose(np.arctan2(relative[1, 0], relative[0, 0]), 0.07, atol=1e-5)
 
 
-def test_joints_keep_their_speed_limits(env: Env, region: np.ndarray) -> None:
+def test_joints_keep_their_speed_limits(env: Env) -> None:
     """However far away the commanded pose, no servo target is further than the limit allows."""
-    runner = worlds.runner("lift_spam")
+    runner = worlds.runner("lift_spam", env.robot.name)
     params = worlds.params(env)
     state = runner.reset(worlds.keys(1), params)
     far = jnp.tile(jnp.array([1.0, 0, 0, 0, 1.0, 0, 0.3, 0.3, 0.1, 1.0]), (worlds.WORLDS, 1))
     after = runner.step(state, far, params)
-    move = np.abs(np.asarray(after.data.ctrl)[:, :7] - np.asarray(state.data.qpos)[:, :7])
-    allowed = np.array([2.175] * 4 + [2.61] * 3) * 0.05
+    limits = {"panda": [2.175] * 4 + [2.61] * 3, "ur5": [np.pi] * 6}[env.robot.name]  # rad/s
+    joints = slice(len(limits))
+    move = np.abs(np.asarray(after.data.ctrl)[:, joints] - np.asarray(state.data.qpos)[:, joints])
+    allowed = np.array(limits) * 0.05
     assert (move < allowed + 1e-5).all()
     np.testing.assert_allclose((move / allowed).max(1), 1.0, atol=1e-4)  # as fast as allowed
 

@@ -142,7 +142,7 @@ def test_what_was_not_asked_for_is_refused(
 
 
 def break_version(file: h5py.File) -> None:
-    file["data"].attrs["version"] = 99
+    file["data"].attrs["version"] = 1
 
 
 def break_total(file: h5py.File) -> None:
@@ -164,7 +164,7 @@ def break_group(file: h5py.File) -> None:
 @pytest.mark.parametrize(
     ("harm", "message"),
     [
-        (break_version, "expected version 1, found 99"),
+        (break_version, "expected version 2, found 1; move it away and collect again"),
         (break_total, "tcp is incomplete or not finite"),
         (break_values, "actions is incomplete or not finite"),
         (break_group, "not a whole demonstration file"),
