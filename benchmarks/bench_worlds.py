@@ -22,7 +22,7 @@ from palm_jax.envs.rollout import Runner, repeat_params
 from palm_jax.train import figures, grids
 
 DOMAINS = ("in_domain", "workspace")
-CELLS = (4, 6)
+CELLS = (4, 7)
 """Cells of the test region along x and y."""
 
 RANDOM_STEPS = 60
