@@ -157,7 +157,11 @@ class Runner:
           state, params: leading axis [W].
           action: [W, 10].
         """
-        state = self._act(state, action)
+        return self.jump(self._act(state, action), params)
+
+    def jump(self, state: State, params: EnvParams) -> State:
+        """The global policy in those of W worlds in which `State.jump` says that a stage has
+        changed; the others stay as they are."""
         if len(self.env.task.stages) > 1 and np.asarray(state.jump).any():
             state = self._jump(state, self._locate(state, params), params)
         return state
