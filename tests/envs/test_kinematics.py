@@ -221,9 +221,10 @@ def test_a_commanded_delta_is_reached_within_one_step(
 ) -> None:
     """From rest, anywhere in the region: joint targets are exact, the servos cover most of the way.
 
-    Measured over 64 poses: inverse kinematics leaves well under 1 % of the way. In the 50 ms of one
-    step the servos, starting at rest, cover 96 % of it (median; 94 % in the worst tenth). The
-    next command starts from the measured pose, so that the rest is not lost.
+    Measured with the Panda over 64 poses: inverse kinematics leaves well under 1 % of the way. In
+    the 50 ms of one step the servos, starting at rest, cover 96 % of it (median; 94 % in the worst
+    tenth). The UR5's, over 256 poses: 97 % and 95 %. The next command starts from the measured
+    pose, so that the rest is not lost.
     """
     runner = worlds.runner("lift_spam", env.robot.name)
     params, actions = worlds.params(env), deltas(len(region))
