@@ -178,7 +178,7 @@ def step_towards(
     target: jax.Array,
     *,
     gain: float = STEP_GAIN,
-    max_distance: float = 0.010,
+    max_distance: float = 0.006,
     max_angle: float = 0.07,
 ) -> jax.Array:
     """Next pose [4, 4] on the way from `tcp` to `target`, both [4, 4]: a saturated proportional
