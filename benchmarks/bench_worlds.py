@@ -43,7 +43,7 @@ def run(
       tasks, robots: names.
       scenes: expert episodes in each of `DOMAINS`.
       random: episodes of each kind of random actions.
-      folder: where to put a map of the expert's success for each task and robot, if anywhere.
+      folder: where to put maps of the expert's success, one file a task, if anywhere.
     """
     found: dict[str, Any] = {}
     for task in tasks:
@@ -53,15 +53,16 @@ def run(
             found.setdefault(task, {})[robot] = result
             seconds = time.perf_counter() - start
             print(f"{line(task, robot, result)}  {seconds:.0f} s", file=sys.stderr, flush=True)
-            if folder:
-                draw(task, robot, result, folder)
+        if folder:
+            draw(task, found[task], folder)
     rates = [result["workspace"]["success"] for row in found.values() for result in row.values()]
     return {"worst_expert_success": min(rates), "tasks": found}
 
 
 def world(runner: Runner, scenes: int, random: int) -> dict[str, Any]:
     """The figures of one task on one robot."""
-    second, result = replay.Replay(runner), {}
+    second = replay.Replay(runner)
+    result: dict[str, Any] = {}
     for index, domain in enumerate(DOMAINS):
         params = _params(runner, domain)
         key = jax.random.fold_in(jax.random.key(7), index)
@@ -137,7 +138,10 @@ def _cells(xy: np.ndarray, solved: np.ndarray) -> dict[str, Any]:
         np.linspace(low, high, cells + 1)
         for low, high, cells in zip(shifts.TEST_LOW, shifts.TEST_HIGH, CELLS, strict=True)
     ]
-    counts, good = (np.histogram2d(*rows.T, bins=edges)[0].astype(int) for rows in (xy, xy[solved]))
+    counts, good = (
+        np.histogram2d(rows[:, 0], rows[:, 1], bins=edges)[0].astype(int)
+        for rows in (xy, xy[solved])
+    )
     return {
         "x_edges": edges[0].tolist(),
         "y_edges": edges[1].tolist(),
@@ -148,7 +152,8 @@ def _cells(xy: np.ndarray, solved: np.ndarray) -> dict[str, Any]:
 
 def _contacts(env: Env, batches: Sequence[_Batch]) -> dict[str, Any]:
     """Of the solved episodes: where it failed, the object may have been knocked over."""
-    slips, depths = [0.0], {}
+    slips = [0.0]
+    depths: dict[str, dict[str, Any]] = {}
     for batch in batches:
         worlds = np.flatnonzero(batch.seen.success[-1] & ~batch.seen.nan[-1])
         slips.append(soundness.largest_slip(env, batch.seen, batch.length, worlds))
@@ -187,17 +192,16 @@ def line(task: str, robot: str, result: dict[str, Any]) -> str:
     return " ".join(parts)
 
 
-def draw(task: str, robot: str, result: dict[str, Any], folder: Path) -> Path:
-    """A map of the expert's success over the test region, `expert_TASK_ROBOT.png`."""
-    cells = result["workspace"]["cells"]
-    panel = grids.Grid(
-        *(np.array(cells[name], float) for name in ("x_edges", "y_edges", "solved", "episodes"))
-    )
-    figure = figures.heatmaps(
-        {f"expert, {robot}": panel}, grids.Regions(), title=f"{task.replace('_', ' ')}, the expert"
-    )
-    folder.mkdir(parents=True, exist_ok=True)
-    return figures.save(figure, folder / f"expert_{task}_{robot}.png")
+def draw(task: str, by_robot: dict[str, Any], folder: Path) -> Path:
+    """Maps of the expert's success over the test region, one for each robot: `expert_TASK.png`."""
+    panels = {}
+    for robot, result in by_robot.items():
+        cells = result["workspace"]["cells"]
+        names = ("x_edges", "y_edges", "solved", "episodes")
+        panels[robot] = grids.Grid(*(np.array(cells[name], float) for name in names))
+    title = f"{task.replace('_', ' ').capitalize()}: the scripted expert"
+    figure = figures.heatmaps(panels, grids.Regions(), title=title)
+    return figures.save(figure, folder / f"expert_{task}.png")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

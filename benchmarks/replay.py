@@ -59,7 +59,7 @@ class Replay:
             if jumped.any():
                 state = runner.jump(state, params)
                 for world in np.flatnonzero(jumped):
-                    _write(worlds[world], state, world)
+                    _write(worlds[world], state, int(world))
             found.append(
                 jax.tree.map(np.asarray, (_tcp(runner.env, state), state.success, state.nan))
             )

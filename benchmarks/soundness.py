@@ -18,7 +18,7 @@ _TOGGLE = 0.1  # share of the steps in which a pushing hand commands its gripper
 class Seen(NamedTuple):
     """What is kept of the states of W worlds; stacked, every field is [T + 1, W, ...]."""
 
-    tcp: np.ndarray  # [W, 4, 4]
+    tcp: Any  # [W, 4, 4]
     position: np.ndarray  # [W, B, 3] of the movable bodies, metres
     geoms: np.ndarray  # int [W, C, 2] of each contact, -1 where there is none
     distance: np.ndarray  # [W, C] metres

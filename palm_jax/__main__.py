@@ -35,7 +35,7 @@ palm-jax: the benchmarks are not part of the installed package. Run them from a 
 
     git clone <this repository> && cd <its folder>
     make bench                                  # or, in an environment with the bench extra:
-    python -m palm_jax bench [render|physics|train|align]
+    python -m palm_jax bench [render|physics|train|align|worlds]
 """
 
 

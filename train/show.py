@@ -85,10 +85,11 @@ def checked(config: ShowConfig) -> ShowConfig:
                 raise ShowError(f"unknown {kind} {name!r}; known: {', '.join(known)}")
     for domain in config.domains:
         try:
-            if shifts.other_robot(domain):
-                raise ShowError(f"domain {domain!r}: here the robots are rows; see --robots")
+            elsewhere = shifts.other_robot(domain)
         except ValueError as error:
             raise ShowError(str(error)) from error
+        if elsewhere:
+            raise ShowError(f"domain {domain!r}: the robots are rows here; see --robots")
     if config.size < 16:
         raise ShowError(f"expected pictures of at least 16 pixels, got --size {config.size}")
     return dataclasses.replace(
@@ -178,19 +179,18 @@ def moments(stage: Sequence[int], stages: Sequence[Stage]) -> tuple[list[int], l
 
     Args:
       stage: after each of the steps, the start first.
-      stages: the task's.
+      stages: the task's; of more than one, picking and placing take turns.
     """
     end = len(stage) - 1
     if len(stages) == 1:
         return [0, end // 2, end], ["start", "middle", "end"]
     steps, labels = [0], ["start"]
-    counts = {True: 0, False: 0}
-    for index, part in enumerate(stages[:-1]):
-        counts[part.open_hand] += 1
+    several = len(stages) > 2
+    for index in range(len(stages) - 1):
         if index + 1 in stage:
             steps.append(stage.index(index + 1) - 1)
-            what = "picked" if part.open_hand else "placed"
-            labels.append(f"{what} {counts[part.open_hand]}")
+            what = "picked" if stages[index].open_hand else "placed"
+            labels.append(f"{what} {index // 2 + 1}" if several else what)
     return [*steps, end], [*labels, "end"]
 
 
@@ -232,7 +232,7 @@ def show(config: ShowConfig, console: terminal.Console) -> list[Path]:
                 bar.advance()
             files.append(_episodes(task, strips, config.out))
     columns = [_words(domain) for domain in config.domains]
-    title = "One scene of every task on every robot (rows) under every shift (columns)"
+    title = "One scene of every task on every robot, under shifts at full strength"
     figure = figures.picture_grid(starts, rows, columns, title=title)
     return [figures.save(figure, config.out / "worlds.png"), *files]
 

@@ -302,3 +302,38 @@ def test_every_method_is_told_apart_by_more_than_colour() -> None:
     assert len({look.colour for look in looks}) == len(METHODS)
     assert len({look.marker for look in looks}) == len(METHODS)
     assert figures.look("mine") == figures.look("mine")
+
+
+def test_picture_grid_shows_each_picture_in_its_place() -> None:
+    def flat(level: int) -> np.ndarray:
+        return np.full((4, 4, 3), level, np.uint8)
+
+    pictures = [[flat(10), None, flat(30)], [flat(40), flat(50), flat(60)]]
+    figure = figures.picture_grid(pictures, ["lift lid\nur5", "b"], ["x", "y", "z"], title="All")
+    assert {"lift lid\nur5", "b", "x", "y", "z", "All"} <= set(texts(figure))
+    at = {}
+    for axes in figure.axes:
+        box = axes.get_position()
+        shown = [int(np.asarray(image.get_array())[0, 0, 0]) for image in axes.images]
+        at[round(box.x0, 3), round(box.y0, 3)] = shown
+    lefts = sorted({x for x, _ in at})
+    top, bottom = sorted({y for _, y in at}, reverse=True)
+    assert [at[x, top] for x in lefts] == [[10], [], [30]]
+    assert [at[x, bottom] for x in lefts] == [[40], [50], [60]]
+
+
+def test_labels_of_a_picture_grid_lie_inside_the_figure() -> None:
+    picture = np.zeros((4, 4, 3), np.uint8)
+    name = "calibration translation"
+    figure = figures.picture_grid([[picture]], [name], ["workspace +\nviewpoint"], title="a\nb")
+    figure.draw_without_rendering()
+    for item in figure.findobj(matplotlib.text.Text):
+        if item.get_text() in (name, "workspace +\nviewpoint"):
+            box = item.get_window_extent()
+            assert box.x0 >= 0 and box.y1 <= figure.bbox.y1
+            assert box.x1 <= figure.bbox.x1 and box.y0 >= 0
+
+
+def test_picture_grid_refuses_rows_of_another_length() -> None:
+    with pytest.raises(ValueError, match=r"expected 2 rows of 1 pictures, got rows of \[1, 2\]"):
+        figures.picture_grid([[None], [None, None]], ["a", "b"], ["x"])
