@@ -11,10 +11,11 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint bench clean
+.PHONY: help demo test test-playground lint bench clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
+	@echo "make test-playground  the tests of the MuJoCo Playground adapter, with Playground itself"
 	@echo "make lint   ruff and mypy only"
 	@echo "make bench  speed, side by side with other packages (BENCH_ARGS=\"render\")"
 	@echo "make clean  remove .venv, builds and caches (never runs/)"
@@ -34,6 +35,10 @@ $(VENV)/.test: $(BIN)/python pyproject.toml
 	$(PIP) install --quiet -e '.[test]'
 	@touch $@ $(VENV)/.base
 
+$(VENV)/.playground: $(BIN)/python pyproject.toml
+	$(PIP) install --quiet -e '.[test,playground]'
+	@touch $@ $(VENV)/.test $(VENV)/.base
+
 $(VENV)/.bench: $(BIN)/python pyproject.toml
 	$(PIP) install --quiet -e '.[bench]'
 	@touch $@ $(VENV)/.base
@@ -48,6 +53,11 @@ lint: $(VENV)/.test
 
 test: lint
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+# The import comes first because the tests skip themselves without the package.
+test-playground: $(VENV)/.playground
+	$(BIN)/python -c 'import mujoco_playground'
+	$(BIN)/python -m pytest tests/envs/test_playground.py $(PYTEST_ARGS)
 
 bench: $(VENV)/.bench
 	$(BIN)/python -m palm_jax bench $(BENCH_ARGS)

@@ -1,12 +1,13 @@
 """`python -m palm_jax bench [render|physics|align|train|eval|all] [--json FILE]`.
 
+`bench worlds` has its own options, see `benchmarks.bench_worlds`.
+
 Prints one JSON: `palm_jax` has the headline figure of each benchmark that ran, `details` all that
 was measured, the rest on what and when.
 """
 
 import argparse
 import importlib
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -49,6 +50,9 @@ def collect(names: Sequence[str]) -> dict[str, Any]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns the exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words[:1] == ["worlds"]:
+        return int(importlib.import_module("benchmarks.bench_worlds").main(words[1:]))
     parser = argparse.ArgumentParser(
         prog="python -m palm_jax bench", description="Speed, as JSON; best on an idle machine."
     )
@@ -56,20 +60,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         "names",
         nargs="*",
         metavar="NAME",
-        help=f"any of {', '.join(BENCHMARKS)}, or all (the default)",
+        help=f"any of {', '.join(BENCHMARKS)}, or all (the default); or worlds, which has options",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the JSON there as well")
-    options = parser.parse_args(argv)
+    options = parser.parse_args(words)
     names = options.names or ["all"]
     unknown = [name for name in names if name not in (*BENCHMARKS, "all")]
     if unknown:
-        parser.error(f"unknown benchmark {unknown[0]!r}; known: {', '.join(BENCHMARKS)}, all")
+        parser.error(
+            f"unknown benchmark {unknown[0]!r}; known: {', '.join(BENCHMARKS)}, all, worlds"
+        )
     result = collect(list(BENCHMARKS) if "all" in names else list(dict.fromkeys(names)))
-    text = json.dumps(result, indent=2)
-    if options.json:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(text + "\n")
-    print(text)
+    common.publish(result, options.json)
     return 0
 
 

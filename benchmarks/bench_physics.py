@@ -1,6 +1,12 @@
-"""Physics steps of 5 ms a second: MJX as the environments run it, and C MuJoCo beside it."""
+"""Physics steps of 5 ms a second: MJX as the environments run it, and C MuJoCo beside it; and how
+long an environment takes to compile."""
 
+import json
 import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -9,18 +15,79 @@ import numpy as np
 from mujoco import rollout
 
 from benchmarks.common import measure
-from palm_jax.envs import TASKS, make, physics
+from palm_jax.envs import ROBOTS, TASKS, make, physics
 from palm_jax.envs.base import Env
 from palm_jax.envs.rollout import repeat_params
 
 SUBSTEPS = 10
 
 
+COMPILED = ("lift_spam", "panda")
+"""The task and the robot whose compile time is measured."""
+
+_COMPILE_CACHE = {
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "0",
+}
+
+
 def run(*, worlds: tuple[int, ...] = (64, 128), repeats: int = 10) -> dict[str, Any]:
-    """Steps/s by task and worlds; `steps_per_second` is the best of lift_spam."""
-    tasks = {task: _task(make(task), worlds, repeats) for task in TASKS}
+    """Steps/s by robot, task and worlds; `steps_per_second` is the best of lift_spam on panda.
+
+    `tasks` are those of the Panda at each of `worlds`; `robots` has every robot at the last.
+    """
+    robots: dict[str, dict[str, dict[str, Any]]] = {}
+    for robot in ROBOTS:
+        counts = worlds if robot == COMPILED[1] else worlds[-1:]
+        robots[robot] = {}
+        for task in TASKS:
+            robots[robot][task] = _task(make(task, robot), counts, repeats)
+            _report(task, robot, robots[robot][task][str(worlds[-1])])
+    tasks = robots[COMPILED[1]]
     best = max(figures["mjx"]["per_second"] for figures in tasks["lift_spam"].values())
-    return {"steps_per_second": best, "tasks": tasks, "substeps": SUBSTEPS, "timestep": 0.005}
+    return {
+        "steps_per_second": best,
+        "tasks": tasks,
+        "robots": {
+            robot: {task: rows[str(worlds[-1])] for task, rows in by_task.items()}
+            for robot, by_task in robots.items()
+        },
+        "compile": compile_seconds(*COMPILED, worlds=worlds[-1]),
+        "substeps": SUBSTEPS,
+        "timestep": 0.005,
+    }
+
+
+def _report(task: str, robot: str, figures: dict[str, dict[str, float]]) -> None:
+    """A row of the table for people, on stderr: stdout is the JSON."""
+    ours, theirs = (figures[name]["per_second"] for name in ("mjx", "mujoco.rollout"))
+    print(
+        f"  {task:<22} {robot:<6} MJX {ours:>8.0f} steps/s   C MuJoCo {theirs:>8.0f} steps/s",
+        file=sys.stderr,
+        flush=True,
+    )
+
+
+def compile_seconds(task: str, robot: str, *, worlds: int) -> dict[str, Any]:
+    """Seconds until the first `reset` and `step` of a new process are done (imports left out): with
+    an empty folder of compiled programs, and with the one that this leaves."""
+    found: dict[str, Any] = {"task": task, "robot": robot, "worlds": worlds}
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, **_COMPILE_CACHE, "JAX_COMPILATION_CACHE_DIR": folder}
+        for name in ("cold_seconds", "warm_seconds"):
+            words = [sys.executable, "-m", "benchmarks.first_step", task, robot, str(worlds)]
+            done = subprocess.run(
+                words,
+                env=environment,
+                cwd=Path(__file__).resolve().parents[1],
+                check=True,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+            found[name] = json.loads(done.stdout.splitlines()[-1])["seconds"]
+    cold, warm = found["cold_seconds"], found["warm_seconds"]
+    print(f"  first reset and step: {cold:.0f} s, with cache {warm:.0f} s", file=sys.stderr)
+    return found
 
 
 def _task(env: Env, worlds: tuple[int, ...], repeats: int) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """What every benchmark needs: timing, and what the figures were measured on."""
 
 import datetime
+import json
 import os
 import platform
 import resource
@@ -72,3 +73,12 @@ def _processor() -> str:
         return platform.processor() or platform.machine()
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.machine()
+
+
+def publish(result: dict[str, Any], file: Path | None) -> None:
+    """Prints a benchmark's JSON, and writes it to `file` as well if one is given."""
+    text = json.dumps(result, indent=2)
+    if file:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text + "\n")
+    print(text)

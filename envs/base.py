@@ -6,7 +6,9 @@ All functions are pure, for one world; batch them with `jax.vmap`. Everything th
 leaf of `EnvParams`, so a sweep is a `vmap` over params.
 """
 
+import copy
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -45,9 +47,11 @@ WIDE_FRAME = 1024
 _LOCATE_SIZE = 128  # the mask for the global policy: the wide frame at an eighth
 _SUBSTEPS = 10
 _AREA_MARGIN = 0.12  # other objects may stand this far outside the target's region, metres
-_RADIUS_DRAW, _DISTRACTOR_DRAW = 1, 2  # folded into the key: draws beside those of old
 _MAX_DRAWS = 16  # start poses drawn before an episode is declared impossible
 _IN_REACH = 0.002  # metres and radians that a start pose may be off
+_STILL_SEEN = 0.7  # share of a target's mask below which its earlier sighting is trusted more
+# Folded into a scene's key, so that one more draw leaves those that were there before unchanged.
+_RADIUS_DRAW, _DISTRACTOR_DRAW, _LAYOUT_DRAW, _LATER_DRAW = range(1, 5)
 CONTROL_RATE = 20.0
 """Control steps a second."""
 
@@ -62,8 +66,13 @@ class State:
     camera_angle: jax.Array  # [] its turn from the nominal pose, radians
     object_start: jax.Array  # [3] the target object's position at the start
     object_yaw: jax.Array  # [] and its yaw
-    located: jax.Array  # [2] xy that the global policy found
-    seen: jax.Array  # bool []: the target was in the global policy's mask
+    key: jax.Array  # uint32 [2]: raw key of what is drawn after the start
+    stage: jax.Array  # int32 []: the part of the task that is under way
+    jump: jax.Array  # bool []: it has just begun, and the global policy is yet to be called
+    targets: jax.Array  # [S, 2] xy of each stage's target as the global policy last found it
+    pixels: jax.Array  # [S] size of its mask then, 0 where it was never seen
+    located: jax.Array  # [2] the one of the present stage, when it began
+    seen: jax.Array  # bool []: it has been in the global policy's mask
     draws: jax.Array  # int32 [] start poses drawn until one was in reach
     reachable: jax.Array  # bool []: one of them was; otherwise the arm waits at its home pose
     step: jax.Array  # int32 [] control steps taken
@@ -73,6 +82,21 @@ class State:
 
 def _uniform(key: jax.Array, bounds: jax.Array) -> jax.Array:
     return jax.random.uniform(key, (), minval=bounds[0], maxval=bounds[1])
+
+
+def _pose_keys(key: jax.Array) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+    """(xy, height), yaw."""
+    xy_key, height_key, yaw_key = jax.random.split(key, 3)
+    return (xy_key, height_key), yaw_key
+
+
+def _centroid(mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mean pixel (u, v) [2] of a bool mask [H, W], and how many pixels it has []."""
+    weight = mask.astype(jnp.float32)
+    count = weight.sum()
+    centre = jnp.arange(_LOCATE_SIZE) + 0.5
+    uv = jnp.stack([(weight.sum(0) * centre).sum(), (weight.sum(1) * centre).sum()])
+    return uv / jnp.maximum(count, 1.0), count
 
 
 class Env:
@@ -108,10 +132,27 @@ class Env:
         self._gripper_qpos = self._addresses(robot.gripper_joints)
         self._closed = np.asarray(robot.gripper_closed, np.float32)
         self._open = np.asarray(robot.gripper_open, np.float32)
-        self._target_ids = np.array([self.mj_model.geom(g).id for g in task.target_geoms])
+        self._target_ids = [
+            np.array([self.mj_model.geom(g).id for g in stage.target_geoms])
+            for stage in task.stages
+        ]
+        self._target_heights = np.array([s.target_height for s in task.stages], np.float32)
+        self._opens = np.array([stage.open_hand for stage in task.stages])
+        self._movable_qpos = [self._free_qpos(name) for name in task.movable]
 
     def _addresses(self, joints: tuple[str, ...]) -> np.ndarray:
         return np.array([int(self.mj_model.joint(name).qposadr[0]) for name in joints])
+
+    def _free_qpos(self, body: str) -> int:
+        return int(self.mj_model.jnt_qposadr[self.mj_model.body(body).jntadr[0]])
+
+    def with_model(self, mjx_model: mjx.Model) -> "Env":
+        """This environment with other physics (masses, friction, gains, ...), for domain
+        randomisation; `mjx_model` may be traced. What was read from the model by name, and the
+        arm's kinematics, stay as they are."""
+        other = copy.copy(self)
+        other.mjx_model = mjx_model
+        return other
 
     def default_params(self) -> EnvParams:
         """The training distribution: the paper's front camera, objects within 0.2 x 0.2 m."""
@@ -132,7 +173,7 @@ class Env:
             "area_high": np.minimum(centre + 0.1 + _AREA_MARGIN, TEST_HIGH),
             "distractors": 0.0,
             "start_radius": 0.06,
-            "start_height": [self.task.start_height],
+            "start_height": [stage.start_height for stage in self.task.stages],
             "start_yaw": (-0.5, 0.5),
             "align_hand": 0.0,
             "light_ambient": lights.ambient,
@@ -143,7 +184,7 @@ class Env:
             "table_rgb": table.rgb,
             "table_rgb2": table.rgb2,
             "table_scale": table.scale,
-            "robot_visible": 1.0,
+            "robot_visible": float(self.task.robot_visible),
         }
         return EnvParams(**{k: jnp.asarray(v, jnp.float32) for k, v in values.items()})
 
@@ -162,7 +203,10 @@ class Env:
         yaw = _uniform(yaw_key, params.object_yaw)
         angle = _uniform(camera_key, params.camera_angle)
         radius = _uniform(jax.random.fold_in(key, _RADIUS_DRAW), params.camera_radius)
-        placement = self.task.place(self._ids, self._home_qpos(), xy, yaw)
+        area = jnp.stack([params.area_low, params.area_high])
+        placement = self.task.place(
+            self._ids, jax.random.fold_in(key, _LAYOUT_DRAW), self._home_qpos(), xy, yaw, area
+        )
         parked = self._distractors.parked()
         data = mjx.make_data(self.mjx_model).replace(
             qpos=placement.qpos,
@@ -188,6 +232,11 @@ class Env:
             camera_angle=angle,
             object_start=self.task.object_position(self._ids, data),
             object_yaw=yaw,
+            key=jax.random.key_data(jax.random.fold_in(key, _LATER_DRAW)),
+            stage=jnp.zeros((), jnp.int32),
+            jump=jnp.zeros((), bool),
+            targets=jnp.tile(jnp.asarray(WORKSPACE_CENTRE[:2]), (len(self.task.stages), 1)),
+            pixels=jnp.zeros(len(self.task.stages)),
             located=xy,
             seen=jnp.ones((), bool),
             draws=jnp.zeros((), jnp.int32),
@@ -220,46 +269,42 @@ class Env:
         )
 
     def locate(self, state: State, params: EnvParams) -> State:
-        """The analytic global policy, first half: the target's xy from its rendered mask.
+        """The analytic global policy, first half: the targets' xy from their rendered masks.
 
-        The centroid of the mask is carried along its ray to the object's centre height (paper,
-        section III-D). A target that is not in the mask leaves the workspace centre and `seen =
-        False`.
+        The centroid of a mask is carried along its ray to the object's centre height (paper,
+        section III-D). A target of which the hand now hides most stays where it was last seen well;
+        one that has never been in view leaves the workspace centre and `seen = False`.
         """
         camera = self.camera(state, params, frame=WIDE_FRAME).scaled(_LOCATE_SIZE / WIDE_FRAME)
         believed = self.calibrated_camera(state, params).scaled(_LOCATE_SIZE / WIDE_FRAME)
         frame = render(self.scene(state, params), camera, outputs=("segmentation",))
         assert frame.segmentation is not None
-        mask = jnp.isin(frame.segmentation, jnp.asarray(self._target_ids)).astype(jnp.float32)
-        count = mask.sum()
-        centre = jnp.arange(_LOCATE_SIZE) + 0.5
-        uv = jnp.stack([(mask.sum(0) * centre).sum(), (mask.sum(1) * centre).sum()])
-        point = unproject_to_height(believed, uv / jnp.maximum(count, 1.0), self.task.target_height)
-        xy = jnp.where(count > 0, point[:2], jnp.asarray(WORKSPACE_CENTRE[:2]))
-        return dataclasses.replace(state, located=xy, seen=count > 0)
+        found = [
+            _centroid(jnp.isin(frame.segmentation, jnp.asarray(ids))) for ids in self._target_ids
+        ]
+        uv, count = (jnp.stack(values) for values in zip(*found, strict=True))
+        xy = jax.vmap(lambda uv, z: unproject_to_height(believed, uv, z)[:2])(
+            uv, jnp.asarray(self._target_heights)
+        )
+        clear = (count > 0) & (count >= _STILL_SEEN * state.pixels)
+        targets = jnp.where(clear[:, None], xy, state.targets)
+        pixels = jnp.maximum(count, state.pixels)
+        return dataclasses.replace(
+            state,
+            targets=targets,
+            pixels=pixels,
+            located=targets[state.stage],
+            seen=pixels[state.stage] > 0,
+        )
 
     def reposition(self, key: jax.Array, state: State, params: EnvParams) -> State:
-        """The global policy, second half: the TCP goes to a random xy near the located target.
+        """The global policy, second half: the TCP goes to a random pose near the located target.
 
         A pose out of the arm's reach is drawn again, up to a bound; `State.draws` counts.
         """
-
-        def draw(
-            carry: tuple[jax.Array, jax.Array, jax.Array],
-        ) -> tuple[jax.Array, jax.Array, jax.Array]:
-            count = carry[0]
-            target = self._start_pose(jax.random.fold_in(key, count), state, params)
-            arm = control.reach(self.chain, home, target)
-            tcp = control.forward_kinematics(self.chain, arm).tcp
-            return count + 1, arm, jnp.all(jnp.abs(control.pose_error(tcp, target)) < _IN_REACH)
-
-        home = jnp.asarray(self.chain.home)
-        draws, arm, reachable = jax.lax.while_loop(
-            lambda carry: ~carry[2] & (carry[0] < _MAX_DRAWS),
-            draw,
-            (jnp.zeros((), jnp.int32), home, jnp.zeros((), bool)),
+        arm, draws, reachable = self._draw_arm(
+            key, lambda key: self._start_pose(key, state, params), jnp.ones((), bool)
         )
-        arm = jnp.where(reachable, arm, home)
         data = state.data.replace(
             qpos=state.data.qpos.at[self._arm_qpos].set(arm),
             ctrl=self._servo_targets(arm, jnp.ones(())),
@@ -267,17 +312,109 @@ class Env:
         data = mjx.kinematics(self.mjx_model, data)
         return dataclasses.replace(state, data=data, draws=draws, reachable=reachable)
 
+    def jump(self, state: State, params: EnvParams) -> State:
+        """Where `state.jump`: the second half of the global policy at a change of stage.
+
+        The hand goes, as it is turned, to a random xy near the target that `locate` found, and to
+        the stage's start height. What it holds goes with it; to pick, it opens. An arm that cannot
+        reach any of the drawn poses stays where it is.
+        """
+        key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
+        tcp = self.tcp(state)
+        arm, draws, reachable = self._draw_arm(
+            key, lambda key: self._next_pose(key, state, params), state.jump
+        )
+        moves = state.jump & reachable
+        data = state.data
+        arm = jnp.where(moves, arm, data.qpos[self._arm_qpos])
+        qpos = data.qpos.at[self._arm_qpos].set(arm)
+        motion = control.forward_kinematics(self.chain, arm).tcp @ control.inverse(tcp)
+        held = self.task.held(self._ids, data)
+        for address, body_held in zip(self._movable_qpos, held, strict=True):
+            pose = qpos[address : address + 7]
+            moved = jnp.where(moves & body_held, control.carried(motion, pose), pose)
+            qpos = qpos.at[address : address + 7].set(moved)
+        opens = moves & jnp.asarray(self._opens)[state.stage]
+        qpos = qpos.at[self._gripper_qpos].set(
+            jnp.where(opens, self._open, qpos[self._gripper_qpos])
+        )
+        opened = self._servo_targets(arm, jnp.ones(()))
+        kept = jnp.concatenate([arm, data.ctrl[-len(self._open) :]])
+        data = data.replace(
+            qpos=qpos,
+            qvel=jnp.where(moves, 0.0, data.qvel),
+            qacc_warmstart=jnp.where(moves, 0.0, data.qacc_warmstart),
+            ctrl=jnp.where(moves, jnp.where(opens, opened, kept), data.ctrl),
+        )
+        data = mjx.kinematics(self.mjx_model, data)
+        return dataclasses.replace(
+            state, data=data, draws=state.draws + draws, jump=jnp.zeros((), bool)
+        )
+
+    def _draw_arm(
+        self, key: jax.Array, draw_pose: Callable[[jax.Array], jax.Array], wanted: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Arm [J] at the first of the drawn TCP poses that is in reach (home where none is, or none
+        is `wanted`), the number of draws, and whether one was."""
+
+        def draw(
+            carry: tuple[jax.Array, jax.Array, jax.Array],
+        ) -> tuple[jax.Array, jax.Array, jax.Array]:
+            count = carry[0]
+            target = draw_pose(jax.random.fold_in(key, count))
+            arm = control.reach(self.chain, home, target)
+            tcp = control.forward_kinematics(self.chain, arm).tcp
+            return count + 1, arm, jnp.all(jnp.abs(control.pose_error(tcp, target)) < _IN_REACH)
+
+        home = jnp.asarray(self.chain.home)
+        draws, arm, reachable = jax.lax.while_loop(
+            lambda carry: ~carry[2] & (carry[0] < _MAX_DRAWS) & wanted,
+            draw,
+            (jnp.zeros((), jnp.int32), home, jnp.zeros((), bool)),
+        )
+        return jnp.where(reachable, arm, home), draws, reachable
+
     def _start_pose(self, key: jax.Array, state: State, params: EnvParams) -> jax.Array:
         """TCP pose [4, 4] near the located target, pointing down."""
-        xy_key, height_key, yaw_key = jax.random.split(key, 3)
-        offset = jax.random.uniform(xy_key, (2,), minval=-1.0, maxval=1.0) * params.start_radius
-        height = TABLE_HEIGHT + _uniform(height_key, params.start_height[0])
+        pose_key, yaw_key = _pose_keys(key)
         yaw = _uniform(yaw_key, params.start_yaw) + params.align_hand * state.camera_angle
-        return control.pointing_down(jnp.append(state.located + offset, height), yaw)
+        return control.pointing_down(self._near_target(pose_key, state, params), yaw)
+
+    def _next_pose(self, key: jax.Array, state: State, params: EnvParams) -> jax.Array:
+        """TCP pose [4, 4] near the located target, turned as it is."""
+        pose_key, _ = _pose_keys(key)
+        return self.tcp(state).at[:3, 3].set(self._near_target(pose_key, state, params))
+
+    def _near_target(
+        self, keys: tuple[jax.Array, jax.Array], state: State, params: EnvParams
+    ) -> jax.Array:
+        """[3] near the located target, at the height that the stage begins with."""
+        xy_key, height_key = keys
+        offset = jax.random.uniform(xy_key, (2,), minval=-1.0, maxval=1.0) * params.start_radius
+        height = TABLE_HEIGHT + _uniform(height_key, params.start_height[state.stage])
+        return jnp.append(state.located + offset, height)
 
     def step(self, state: State, action: jax.Array, params: EnvParams) -> State:
-        """One control step (50 ms) of `action` [10]; see the class. Latches success and NaN."""
-        del params  # physics does not shift (yet): the signature leaves room for it
+        """One control step (50 ms) of `action` [10]; see the class. Latches success and NaN.
+
+        Where a stage of the task ends, the global policy puts the hand near the next target before
+        the step returns. Batches do better with `Runner.step` or `rollout.step_worlds`: under
+        `vmap` every world would pay for the global policy in every step.
+        """
+        state = self.act(state, action)
+        if len(self.task.stages) == 1:
+            return state
+        return jax.lax.cond(
+            state.jump, lambda s: self.jump(self.locate(s, params), params), lambda s: s, state
+        )
+
+    def act(self, state: State, action: jax.Array) -> State:
+        """`step` without the global policy: `State.jump` says where it is yet to be called."""
+        data = state.data.replace(ctrl=self.servo(state, action))
+        return self.judge(state, physics.substeps(self.mjx_model, data, _SUBSTEPS))
+
+    def servo(self, state: State, action: jax.Array) -> jax.Array:
+        """Controls [nu] for an `action` [10]: joint and finger positions to hold for a step."""
         target = apply_delta(self.tcp(state), action[:9])
         now = state.data.qpos[self._arm_qpos]
         arm = now + self._slowed(control.solve_ik(self.chain, now, target) - now)
@@ -285,22 +422,33 @@ class Env:
         goal = jnp.where(action[9] > 0.5, 1.0, 0.0)
         limit = self.robot.gripper_speed
         opening = jnp.mean(gripper) + jnp.clip(goal - jnp.mean(gripper), -limit, limit)
-        data = physics.substeps(
-            self.mjx_model, state.data.replace(ctrl=self._servo_targets(arm, opening)), _SUBSTEPS
-        )
+        return self._servo_targets(arm, opening)
+
+    def judge(self, state: State, data: mjx.Data) -> State:
+        """The state after the physics of a step gave `data`: divergence, success, stage."""
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
         nan = state.nan | ~finite
         data = jax.tree.map(lambda new, old: jnp.where(nan, old, new), data, state.data)
-        solved = self.task.success(self._ids, data, state.object_start) & ~nan
+        after = dataclasses.replace(state, data=data)
+        opening = self.opening(after)
+        solved = self.task.success(self._ids, data, state.object_start, opening) & ~nan
+        success = state.success | solved
+        stage = self.task.next_stage(self._ids, data, state.stage, opening)
+        stage = jnp.where(nan | success, state.stage, stage)
         return dataclasses.replace(
-            state, data=data, step=state.step + 1, success=state.success | solved, nan=nan
+            after,
+            step=state.step + 1,
+            success=success,
+            nan=nan,
+            stage=stage,
+            jump=stage != state.stage,
         )
 
     def expert(self, state: State) -> jax.Array:
         """Action [10] of the scripted expert, which knows the true state."""
         tcp = self.tcp(state)
         command = self.task.expert(
-            self._ids, state.data, tcp, self.opening(state), state.object_start
+            self._ids, state.data, tcp, self.opening(state), state.object_start, state.stage
         )
         delta = encode_delta(tcp, control.step_towards(tcp, command.target))
         return jnp.append(delta, command.gripper)

@@ -147,6 +147,25 @@ def reach(chain: Chain, qpos: jax.Array, target: jax.Array) -> jax.Array:
     return solve_ik(chain, coarse, target, iterations=15, damping=0.01, nullspace=0.0)
 
 
+def inverse(pose: jax.Array) -> jax.Array:
+    """Inverse [4, 4] of a rigid transform [4, 4]."""
+    rotation = pose[:3, :3].T
+    return jnp.eye(4).at[:3, :3].set(rotation).at[:3, 3].set(-rotation @ pose[:3, 3])
+
+
+def carried(motion: jax.Array, pose: jax.Array) -> jax.Array:
+    """Position and unit quaternion [7] of a body after a rigid `motion` [4, 4] of the world.
+
+    The motion turns by less than half a turn.
+    """
+    vector = _rotation_vector(motion[:3, :3])
+    half = jnp.linalg.norm(vector) / 2
+    w, v = jnp.cos(half), 0.5 * jnp.sinc(half / jnp.pi) * vector
+    scalar, axis = pose[3], pose[4:]
+    turned = jnp.append(w * scalar - v @ axis, w * axis + scalar * v + jnp.cross(v, axis))
+    return jnp.concatenate([motion[:3, :3] @ pose[:3] + motion[:3, 3], turned])
+
+
 def pointing_down(position: jax.Array, yaw: jax.Array) -> jax.Array:
     """TCP pose [4, 4] at `position` [3], approaching straight down, x axis at `yaw` []."""
     cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros(())
@@ -159,7 +178,7 @@ def step_towards(
     target: jax.Array,
     *,
     gain: float = STEP_GAIN,
-    max_distance: float = 0.010,
+    max_distance: float = 0.006,
     max_angle: float = 0.07,
 ) -> jax.Array:
     """Next pose [4, 4] on the way from `tcp` to `target`, both [4, 4]: a saturated proportional

@@ -27,6 +27,7 @@ class Frames(NamedTuple):
     qvel: jax.Array  # [W, nv]
     tcp: jax.Array  # [W, 4, 4]
     opening: jax.Array  # [W]
+    stage: jax.Array  # int32 [W]
     action: jax.Array  # [W, 10] the expert's command
     success: jax.Array  # bool [W] solved after the action
 
@@ -84,6 +85,7 @@ class Demonstrator:
                 qvel=before.data.qvel,
                 tcp=command.tcp,
                 opening=command.opening,
+                stage=before.stage,
                 action=command.action,
                 success=state.success,
             )

@@ -72,6 +72,39 @@ def _check_reachable(state: State, params: EnvParams) -> None:
         )
 
 
+def _jump_if_asked(env: Env) -> Callable[[State, State, EnvParams], State]:
+    """(state, the same located anew, params) -> the state after the global policy, where a stage
+    has changed; other worlds stay as they are."""
+
+    def jump(state: State, located: State, params: EnvParams) -> State:
+        moved = env.jump(located, params)
+        return jax.tree.map(lambda new, old: jnp.where(state.jump, new, old), moved, state)
+
+    return jump
+
+
+def step_worlds(env: Env, state: State, action: jax.Array, params: EnvParams) -> State:
+    """`Env.step` of W worlds in one jittable piece, for accelerators.
+
+    The global policy is a branch for the whole batch: taken only when a stage has changed in one
+    of its worlds.
+
+    Args:
+      env: the environment.
+      state, params: leading axis [W].
+      action: [W, 10].
+    """
+    state = jax.vmap(env.act)(state, action)
+    if len(env.task.stages) == 1:
+        return state
+
+    def jump(state: State) -> State:
+        located = jax.vmap(env.locate)(state, params)
+        return jax.vmap(_jump_if_asked(env))(state, located, params)
+
+    return jax.lax.cond(jnp.any(state.jump), jump, lambda state: state, state)
+
+
 def _full_frame(env: Env, state: State, params: EnvParams, *, size: int) -> jax.Array:
     rgb = env.render(state, params, size).rgb
     assert rgb is not None
@@ -93,7 +126,8 @@ class Runner:
             )
         self.env = env
         self.worlds = worlds
-        self.step = physics.jit_physics(jax.vmap(env.step))
+        self._act = physics.jit_physics(jax.vmap(env.act))
+        self._jump = physics.jit_physics(jax.vmap(_jump_if_asked(env)))
         self.expert = physics.jit_physics(jax.vmap(env.expert))
         self._place = physics.jit_physics(jax.vmap(env.place))
         self._locate = jax.jit(jax.vmap(env.locate))
@@ -114,6 +148,22 @@ class Runner:
         state = self._place(keys[:, 0], params)
         state = self._reposition(keys[:, 1], self._locate(state, params), params)
         _check_reachable(state, params)
+        return state
+
+    def step(self, state: State, action: jax.Array, params: EnvParams) -> State:
+        """`Env.step` of W worlds: the global policy runs only when a stage has changed somewhere.
+
+        Args:
+          state, params: leading axis [W].
+          action: [W, 10].
+        """
+        return self.jump(self._act(state, action), params)
+
+    def jump(self, state: State, params: EnvParams) -> State:
+        """The global policy in those of W worlds in which `State.jump` says that a stage has
+        changed; the others stay as they are."""
+        if len(self.env.task.stages) > 1 and np.asarray(state.jump).any():
+            state = self._jump(state, self._locate(state, params), params)
         return state
 
     def observe(
@@ -205,7 +255,7 @@ def scan_episodes(
         state, length = carry
         seen = jax.vmap(observe)(state, params)
         action = act(jax.random.fold_in(key, t), seen.image, seen.proprio)
-        state = jax.vmap(env.step)(state, action, params)
+        state = step_worlds(env, state, action, params)
         done = state.success | state.nan
         return (state, jnp.where(done, jnp.minimum(length, t + 1), length)), None
 

@@ -43,7 +43,7 @@ _ROTATION = np.radians(3.0) / np.sqrt(3) * np.ones(3)
 _TRANSLATION = 0.03 / np.sqrt(3) * np.ones(3)
 
 
-def _towards(start: jax.Array, end: ArrayLike, strength: ArrayLike) -> jax.Array:
+def _towards(start: jax.Array, end: ArrayLike, strength: jax.Array) -> jax.Array:
     """`start` at strength 0, bit for bit; `end` at strength 1."""
     return start + strength * (jnp.asarray(end, jnp.float32) - start)
 
@@ -67,14 +67,14 @@ def workspace(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
 def viewpoint(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
     """The camera turned by up to 30 degrees either way about the workspace centre."""
     strength = _checked(viewpoint, strength)
-    bounds = (-MAX_CAMERA_ANGLE, MAX_CAMERA_ANGLE)
+    bounds = jnp.array([-MAX_CAMERA_ANGLE, MAX_CAMERA_ANGLE])
     return dataclasses.replace(params, camera_angle=_towards(params.camera_angle, bounds, strength))
 
 
 def viewpoint_cone(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
     """`viewpoint`, and the camera 0.8 to 1.2 times as far from the workspace centre."""
     strength = _checked(viewpoint_cone, strength)
-    radius = _towards(params.camera_radius, RADIUS_RANGE, strength)
+    radius = _towards(params.camera_radius, jnp.array(RADIUS_RANGE), strength)
     return dataclasses.replace(viewpoint(params, strength=strength), camera_radius=radius)
 
 
@@ -214,7 +214,7 @@ def strength_range(name: str) -> tuple[float, float]:
     return (0.0 if name in SHIFTS or name == distractors.__name__ else -1.0), 1.0
 
 
-def _checked(shift: Shift, strength: ArrayLike) -> ArrayLike:
+def _checked(shift: Shift, strength: ArrayLike) -> jax.Array:
     """`strength`, if it may be one of `shift`'s; traced strengths pass."""
     if is_concrete(strength):
         low, high = strength_range(shift.__name__)
@@ -224,7 +224,7 @@ def _checked(shift: Shift, strength: ArrayLike) -> ArrayLike:
                 f"{shift.__name__}: expected a strength from {low:g} to {high:g}, got "
                 f"{value.tolist()}; several strengths at once are a jax.vmap"
             )
-    return strength
+    return jnp.asarray(strength, jnp.float32)
 
 
 def parts(domain: str) -> tuple[str, ...]:

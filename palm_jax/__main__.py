@@ -26,6 +26,7 @@ VERBS: dict[str, Verb] = {
     "train": Verb("palm_jax.train.__main__", "collect demonstrations, train, evaluate, report"),
     "sweep": Verb("palm_jax.train.sweep", "success over a grid of shifts, for a finished run"),
     "report": Verb("palm_jax.train.report", "one self-contained HTML page from run folders"),
+    "show": Verb("palm_jax.train.show", "pictures of every task, robot and shift, as PNG"),
     "bench": Verb("benchmarks.__main__", "speed, side by side with peers (needs a checkout)"),
 }
 

@@ -888,3 +888,62 @@ def _domain_name(domain: str) -> str:
 
 def _wrapped(name: str) -> str:
     return name.replace(" w/o ", "\nw/o ") if len(name) > 12 else name
+
+
+# ---------------------------------------------------------------------------------------------
+# (g) What the worlds look like
+
+
+@_styled
+def picture_grid(
+    pictures: Sequence[Sequence[ImageArray | None]],
+    rows: Sequence[str],
+    columns: Sequence[str],
+    *,
+    title: str = "",
+) -> Figure:
+    """A contact sheet: pictures in rows and columns that have names.
+
+    Args:
+      pictures: [row][column] uint8 [h, w, 3], or None for an empty cell.
+      rows, columns: their names; a line break starts a new line.
+      title: above the figure.
+
+    Raises:
+      ValueError: the pictures are not as many as the names.
+    """
+    shape = [len(row) for row in pictures]
+    if shape != [len(columns)] * len(rows):
+        raise ValueError(
+            f"expected {len(rows)} rows of {len(columns)} pictures, got rows of {shape}"
+        )
+    if not pictures or not columns:
+        return _empty("no pictures to draw")
+    cell, gap = 1.28, 0.04
+    left = 0.22 + 0.072 * max(len(line) for name in rows for line in name.split("\n"))
+    head = 0.16 + 0.16 * max(name.count("\n") + 1 for name in columns)
+    top = head + (0.08 + 0.19 * (title.count("\n") + 1) if title else 0.0)
+    width, height = left + cell * len(columns), top + cell * len(rows)
+    figure = Figure(figsize=(width, height))
+    for i, row in enumerate(pictures):
+        for j, picture in enumerate(row):
+            corner = (left + cell * j, height - top - cell * (i + 1) + gap)
+            side = (cell - gap) / width, (cell - gap) / height
+            axes = figure.add_axes((corner[0] / width, corner[1] / height, *side))
+            axes.set_xticks([])
+            axes.set_yticks([])
+            axes.spines[:].set_visible(False)
+            if picture is None:
+                axes.set_facecolor("#f1f3f5")
+            else:
+                axes.imshow(picture, interpolation="nearest", aspect="equal")
+            if i == 0:
+                axes.set_title(columns[j], loc="center", pad=4)
+        middle = (height - top - cell * (i + 0.5)) / height
+        figure.text(
+            (left - 0.1) / width, middle, rows[i], ha="right", va="center", fontweight="bold"
+        )
+    if title:
+        figure.suptitle(title, x=0.01, y=1 - 0.06 / height, ha="left", va="top",
+                        fontweight="bold", fontsize=11)  # fmt: skip
+    return figure

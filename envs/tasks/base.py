@@ -26,6 +26,24 @@ class Placement(NamedTuple):
     mocap_quat: jax.Array  # [m, 4]
 
 
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """A part of a task between two calls of the global policy: pick something, place it.
+
+    Attributes:
+      target_geoms: rendered geoms whose mask the global policy looks for.
+      target_height: world z (metres) of the plane on which the mask's centroid is located: the
+        target's centre height (the authors' code uses the true height of the object as well).
+      start_height: (low, high) height of the TCP above the table when the stage begins.
+      open_hand: whether the hand is opened for it (to pick) or keeps what it holds (to place).
+    """
+
+    target_geoms: tuple[str, ...]
+    target_height: float
+    start_height: tuple[float, float]
+    open_hand: bool = True
+
+
 class Command(NamedTuple):
     """What the expert wants: a TCP pose to head for, and the gripper."""
 
@@ -40,21 +58,20 @@ class Task(abc.ABC):
     Attributes:
       name: key in `TASKS`.
       asset: MJCF file name inside `assets/tasks/`.
-      target_geoms: rendered geoms whose mask the global policy looks for.
-      target_height: world z (metres) of the plane on which the mask's centroid is located: the
-        object's centre height (the authors' code uses the true height of the object as well).
-      start_height: (low, high) height of the TCP above the table at the start of an episode.
+      stages: its parts; the global policy is called at the beginning of each.
+      movable: names of the free bodies that a hand can carry.
       crop: side of the TCP crop in pixels of the paper's 512-pixel frame.
       horizon: control steps after which an episode has failed.
+      robot_visible: whether the robot is drawn (physics is the same).
     """
 
     name: str
     asset: str
-    target_geoms: tuple[str, ...]
-    target_height: float
-    start_height: tuple[float, float]
+    stages: tuple[Stage, ...]
+    movable: tuple[str, ...]
     crop: int
     horizon: int
+    robot_visible: bool = dataclasses.field(default=True, kw_only=True)
 
     @abc.abstractmethod
     def contacts(self, robot: Robot) -> tuple[Contact, ...]:
@@ -65,12 +82,39 @@ class Task(abc.ABC):
         """Looks names up in the compiled model, once: the `ids` that the functions below get."""
 
     @abc.abstractmethod
-    def place(self, ids: Any, qpos: jax.Array, xy: jax.Array, yaw: jax.Array) -> Placement:
-        """Puts the target object at `xy` [2] (metres), turned by `yaw` [] about z, at rest."""
+    def place(
+        self,
+        ids: Any,
+        key: jax.Array,
+        qpos: jax.Array,
+        xy: jax.Array,
+        yaw: jax.Array,
+        area: jax.Array,
+    ) -> Placement:
+        """Puts the objects on the table, at rest.
+
+        Args:
+          ids: from `bind`.
+          key: randomness of all but the target object.
+          qpos: [nq] the model's joint positions.
+          xy: [2] where the target object goes, metres.
+          yaw: [] its turn about z, radians.
+          area: [2, 2] lower and upper corner of where the other objects may stand, metres.
+        """
 
     @abc.abstractmethod
-    def success(self, ids: Any, data: mjx.Data, start: jax.Array) -> jax.Array:
+    def next_stage(
+        self, ids: Any, data: mjx.Data, stage: jax.Array, opening: jax.Array
+    ) -> jax.Array:
+        """int32 []: the stage after a control step that was taken in `stage`, from the state."""
+
+    @abc.abstractmethod
+    def success(self, ids: Any, data: mjx.Data, start: jax.Array, opening: jax.Array) -> jax.Array:
         """bool []: solved now. `start` [3] is the target object's position at the start."""
+
+    @abc.abstractmethod
+    def held(self, ids: Any, data: mjx.Data) -> jax.Array:
+        """bool [M]: which of the `movable` bodies both pads touch."""
 
     @abc.abstractmethod
     def object_position(self, ids: Any, data: mjx.Data) -> jax.Array:
@@ -78,6 +122,12 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def expert(
-        self, ids: Any, data: mjx.Data, tcp: jax.Array, opening: jax.Array, start: jax.Array
+        self,
+        ids: Any,
+        data: mjx.Data,
+        tcp: jax.Array,
+        opening: jax.Array,
+        start: jax.Array,
+        stage: jax.Array,
     ) -> Command:
         """Where a scripted expert with the true state would go from here (memoryless)."""

@@ -8,41 +8,24 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
-from palm_jax.envs.control import STEP_GAIN, pointing_down
-from palm_jax.envs.physics import in_contact
 from palm_jax.envs.robots import Robot
 from palm_jax.envs.tasks.base import Command, Placement, Task
+from palm_jax.envs.tasks.skills import Hold, both_touch, hold, pick, turn_to
 from palm_jax.envs.world import Contact
 
 PAD_FRICTION = 1.5
 OBJECT_FRICTION = 0.3  # metal or plastic on wood: a finger that arrives first shifts the object
-# The gripper closes within this of the grasp. The funnel below makes the height tell when that is:
-# what a policy must see at a glance, it learns; a conjunction of millimetres it would wait for.
-_CLOSE_HEIGHT = 0.011
-_CLOSE_RADIUS = 0.013
-_CLOSE_ANGLE = 0.25
-# The funnel: how far the hand stays up for an error sideways or in yaw. Inside the radius the open
-# fingers pass the object: the hand goes all the way down and is put right there.
-_FUNNEL_RADIUS = 0.009
-_FUNNEL_ANGLE = 0.06
-# The lift begins slowly: fingers that have yet to close fully do not slide off.
-_LIFT_SPEED = 0.004  # metres of the first control step
-_LIFT_GAIN = 0.3  # metres a step, per metre risen
-_HOLDING_MARGIN = 0.08  # of opening, above the object's width: from there on the lift begins
-_LIFT_MARGIN = 0.03  # the expert heads for a point this far beyond the height that counts as solved
-_FUNNEL_SLOPE = 3.0  # metres of extra height per metre of lateral error
-_FUNNEL_SLOPE_ANGLE = 0.08  # metres of extra height per radian of yaw error
 
 
 class LiftIds(NamedTuple):
-    """What a lift task needs of the compiled model and the robot."""
+    """Ids in the compiled model that a lift task needs."""
 
     body: int
     qpos: int  # address of the free joint in qpos
     grasp_site: int
     grasp_geom: int
     pads: tuple[int, int]
-    holding: float  # opening (0..1) of the gripper below which the fingers have closed
+    hold: Hold
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +43,8 @@ class LiftTask(Task):
       rest_height: world z of the body at rest.
       lift_height: rise (metres) that solves the task.
       lateral_limit: largest |x| and |y| displacement (metres) that still counts.
-      aligned: whether the opening axis must follow the object's yaw (a round knob needs none).
+      period: yaw (radians) after which the object looks the same to two fingers; None for a round
+        one, which they can take from every side.
     """
 
     body: str
@@ -73,7 +57,7 @@ class LiftTask(Task):
     rest_height: float
     lift_height: float
     lateral_limit: float
-    aligned: bool
+    period: float | None
 
     def contacts(self, robot: Robot) -> tuple[Contact, ...]:
         pads = [Contact(pad, self.grasp_geom, PAD_FRICTION, stiff=True) for pad in robot.pads]
@@ -95,10 +79,19 @@ class LiftTask(Task):
             grasp_site=model.site(self.grasp_site).id,
             grasp_geom=model.geom(self.grasp_geom).id,
             pads=(left, right),
-            holding=self.grasp_width / robot.max_width + _HOLDING_MARGIN,
+            hold=hold(robot, self.grasp_width),
         )
 
-    def place(self, ids: LiftIds, qpos: jax.Array, xy: jax.Array, yaw: jax.Array) -> Placement:
+    def place(
+        self,
+        ids: LiftIds,
+        key: jax.Array,
+        qpos: jax.Array,
+        xy: jax.Array,
+        yaw: jax.Array,
+        area: jax.Array,
+    ) -> Placement:
+        del key, area  # there is nothing but the target
         quat = jnp.stack([jnp.cos(yaw / 2), jnp.zeros(()), jnp.zeros(()), jnp.sin(yaw / 2)])
         pose = jnp.concatenate([xy, jnp.array([self.rest_height]), quat])
         under = [jnp.concatenate([xy, jnp.array([height])]) for _, height in self.mocap]
@@ -111,49 +104,38 @@ class LiftTask(Task):
     def object_position(self, ids: LiftIds, data: mjx.Data) -> jax.Array:
         return data.xpos[ids.body]
 
-    def success(self, ids: LiftIds, data: mjx.Data, start: jax.Array) -> jax.Array:
+    def next_stage(
+        self, ids: LiftIds, data: mjx.Data, stage: jax.Array, opening: jax.Array
+    ) -> jax.Array:
+        return stage
+
+    def held(self, ids: LiftIds, data: mjx.Data) -> jax.Array:
+        return both_touch(data, ids.pads, ids.grasp_geom)[None]
+
+    def success(
+        self, ids: LiftIds, data: mjx.Data, start: jax.Array, opening: jax.Array
+    ) -> jax.Array:
         moved = data.xpos[ids.body] - start
-        held = in_contact(data, ids.pads[0], ids.grasp_geom) & in_contact(
-            data, ids.pads[1], ids.grasp_geom
-        )
         inside = jnp.all(jnp.abs(moved[:2]) <= self.lateral_limit)
-        return held & inside & (moved[2] >= self.lift_height)
+        return self.held(ids, data)[0] & inside & (moved[2] >= self.lift_height)
 
     def expert(
-        self, ids: LiftIds, data: mjx.Data, tcp: jax.Array, opening: jax.Array, start: jax.Array
+        self,
+        ids: LiftIds,
+        data: mjx.Data,
+        tcp: jax.Array,
+        opening: jax.Array,
+        start: jax.Array,
+        stage: jax.Array,
     ) -> Command:
-        hand_yaw = jnp.arctan2(tcp[1, 0], tcp[0, 0])
-        turn = self._turn_to_object(data.xmat[ids.body], hand_yaw)
         grasp = data.site_xpos[ids.grasp_site]
-        lateral = jnp.linalg.norm(grasp[:2] - tcp[:2, 3])
-        above = jnp.clip(
-            _FUNNEL_SLOPE * (lateral - _FUNNEL_RADIUS)
-            + _FUNNEL_SLOPE_ANGLE * (jnp.abs(turn) - _FUNNEL_ANGLE),
-            0.0,
-            0.08,
+        yaw = jnp.arctan2(tcp[1, 0], tcp[0, 0])
+        return pick(
+            tcp,
+            opening,
+            grasp,
+            turn_to(data.xmat[ids.body], yaw, self.period),
+            hold=ids.hold,
+            bottom=start[2] + (grasp[2] - data.xpos[ids.body, 2]),
+            rise=self.lift_height,
         )
-        arrived = (
-            (lateral < _CLOSE_RADIUS)
-            & (jnp.abs(turn) < _CLOSE_ANGLE)
-            & (tcp[2, 3] - grasp[2] < _CLOSE_HEIGHT)
-        )
-        closing = opening < 0.95
-        holding = closing & (opening < ids.holding)
-        bottom = start[2] + (grasp[2] - data.xpos[ids.body, 2])
-        speed = _LIFT_SPEED + _LIFT_GAIN * jnp.maximum(tcp[2, 3] - bottom, 0.0)
-        lifted = jnp.minimum(
-            bottom + self.lift_height + _LIFT_MARGIN, tcp[2, 3] + speed / STEP_GAIN
-        )
-        reach = jnp.concatenate([grasp[:2], (grasp[2] + above)[None]])
-        up = jnp.concatenate([tcp[:2, 3], lifted[None]])
-        stay = jnp.concatenate([tcp[:2, 3], grasp[2:]])
-        position = jnp.where(holding, up, jnp.where(closing, stay, reach))
-        yaw = hand_yaw + jnp.where(closing, 0.0, turn)
-        return Command(pointing_down(position, yaw), jnp.where(arrived | closing, 0.0, 1.0))
-
-    def _turn_to_object(self, rotation: jax.Array, hand_yaw: jax.Array) -> jax.Array:
-        """Yaw [] by which the hand must turn; two fingers are the same after half a turn."""
-        if not self.aligned:
-            return jnp.zeros(())
-        yaw = jnp.arctan2(rotation[1, 0], rotation[0, 0])
-        return jnp.mod(yaw - hand_yaw + jnp.pi / 2, jnp.pi) - jnp.pi / 2

@@ -5,15 +5,14 @@ detector is a box of 0.10 x 0.10 x 0.05 m whose bottom is 0.115 m above the knob
 which the top of the knob enters after 0.105 m.
 """
 
-from palm_jax.envs.tasks.base import TABLE_HEIGHT
+from palm_jax.envs.tasks.base import TABLE_HEIGHT, Stage
 from palm_jax.envs.tasks.lift import LiftTask
 
 LIFT_LID = LiftTask(
     name="lift_lid",
     asset="lift_lid.xml",
-    target_geoms=("lid_plate", "lid_dome", "lid_knob"),
-    target_height=TABLE_HEIGHT + 0.070,
-    start_height=(0.19, 0.24),
+    stages=(Stage(("lid_plate", "lid_dome", "lid_knob"), TABLE_HEIGHT + 0.070, (0.19, 0.24)),),
+    movable=("lid",),
     crop=160,
     horizon=100,
     body="lid",
@@ -26,5 +25,5 @@ LIFT_LID = LiftTask(
     rest_height=TABLE_HEIGHT + 0.077,
     lift_height=0.105,
     lateral_limit=0.05,
-    aligned=False,
+    period=None,
 )

@@ -4,15 +4,21 @@ The paper gives no geometry for this task; the can has the size of the potted me
 set, and success follows Lift Lid: held by both fingers, above a height.
 """
 
-from palm_jax.envs.tasks.base import TABLE_HEIGHT
+import dataclasses
+import math
+
+from palm_jax.envs.tasks.base import TABLE_HEIGHT, Stage
 from palm_jax.envs.tasks.lift import LiftTask
 
 LIFT_SPAM = LiftTask(
     name="lift_spam",
     asset="lift_spam.xml",
-    target_geoms=("spam_can", "spam_label", "spam_lid", "spam_rim"),
-    target_height=TABLE_HEIGHT + 0.04,
-    start_height=(0.15, 0.20),
+    stages=(
+        Stage(
+            ("spam_can", "spam_label", "spam_lid", "spam_rim"), TABLE_HEIGHT + 0.04, (0.15, 0.20)
+        ),
+    ),
+    movable=("spam",),
     crop=200,
     horizon=100,
     body="spam",
@@ -25,5 +31,10 @@ LIFT_SPAM = LiftTask(
     rest_height=TABLE_HEIGHT + 0.04,
     lift_height=0.10,
     lateral_limit=0.20,
-    aligned=True,
+    period=math.pi,
 )
+
+LIFT_SPAM_INVISIBLE = dataclasses.replace(
+    LIFT_SPAM, name="lift_spam_invisible", robot_visible=False
+)
+"""The same with a robot that is not drawn (paper, Q4): no picture shows where the hand is."""

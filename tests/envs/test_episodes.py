@@ -49,7 +49,7 @@ def test_episodes_start_as_the_params_say(task: str, domain: str) -> None:
     tcp = worlds.tcp(env, state)
     offset = tcp[:, :2, 3] - state.located
     assert np.abs(offset).max() < 0.06 + 0.002
-    low, high = env.task.start_height
+    low, high = env.task.stages[0].start_height
     height = tcp[:, 2, 3] - TABLE_HEIGHT
     assert height.min() > low - 0.002 and height.max() < high + 0.002
     assert (tcp[:, 2, 2] < -0.9999).all()  # straight down

@@ -221,9 +221,10 @@ def test_a_commanded_delta_is_reached_within_one_step(
 ) -> None:
     """From rest, anywhere in the region: joint targets are exact, the servos cover most of the way.
 
-    Measured over 64 poses: inverse kinematics leaves well under 1 % of the way. In the 50 ms of one
-    step the servos, starting at rest, cover 96 % of it (median; 94 % in the worst tenth). The
-    next command starts from the measured pose, so that the rest is not lost.
+    Measured with the Panda over 64 poses: inverse kinematics leaves well under 1 % of the way. In
+    the 50 ms of one step the servos, starting at rest, cover 96 % of it (median; 94 % in the worst
+    tenth). The UR5's, over 256 poses: 97 % and 95 %. The next command starts from the measured
+    pose, so that the rest is not lost.
     """
     runner = worlds.runner("lift_spam", env.robot.name)
     params, actions = worlds.params(env), deltas(len(region))
@@ -264,7 +265,7 @@ def test_a_commanded_delta_is_reached_within_one_step(
 def test_speed_limit_of_the_expert() -> None:
     """`step_towards` covers half of a small error, and never more than its limits."""
     start = pose(np.diag([1.0, -1.0, -1.0]), np.array([0.2, 0.1, 1.0]))
-    for distance, covered in ((0.004, 0.002), (0.1, 0.01)):
+    for distance, covered in ((0.004, 0.002), (0.1, 0.006)):
         target = start.copy()
         target[0, 3] += distance
         moved = np.asarray(control.step_towards(jnp.asarray(start), jnp.asarray(target)))

@@ -477,7 +477,7 @@ def test_the_global_policy_locates_with_the_miscalibrated_camera() -> None:
     good, bad = (
         runner.reset(worlds.keys(8), repeat_params(p, worlds.WORLDS)) for p in (default, off)
     )
-    height = env.task.target_height
+    height = env.task.stages[0].target_height
     for world in range(worlds.WORLDS):
         camera = env.camera(jax.tree.map(lambda x, w=world: x[w], good), default)
         uv, _ = project(camera.K, camera.cam_to_world, np.append(good.located[world], height))

@@ -1,0 +1,295 @@
+"""`python -m palm_jax show`: pictures of every world, as PNG.
+
+* `worlds.png`: the start of an episode, every task on every robot under every domain;
+* `TASK.png`: the expert's episode on every robot, with the moments before each change of stage;
+* `axes.png`: each single shift from its least to its greatest strength, for one task.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from palm_jax.align import AlignSpec
+from palm_jax.envs import registry, shifts
+from palm_jax.envs.base import Env, EnvParams, State
+from palm_jax.envs.rollout import Runner
+from palm_jax.envs.tasks import Stage
+from palm_jax.train import console as terminal
+from palm_jax.train import figures
+
+T = TypeVar("T")
+
+DOMAINS = (
+    "in_domain",
+    "workspace",
+    "viewpoint",
+    "workspace+viewpoint",
+    "lighting",
+    "table_texture",
+    "object_color",
+    "field_of_view",
+    "distractors",
+)
+"""Columns of `worlds.png`. The robots are its rows, so no domain needs the embodiment."""
+
+STRENGTHS = (-1.0, -0.5, 0.0, 0.5, 1.0)
+_CALIBRATION = "calibration"  # axes that begin so change what a policy sees, not what a camera does
+_WINDOW = 84
+
+
+@dataclasses.dataclass(frozen=True)
+class ShowConfig:
+    """Pictures of the worlds: worlds.png, axes.png and one PNG for each task.
+
+    Attributes:
+      tasks: names; all of them if empty.
+      robots: names; all of them if empty.
+      domains: columns of worlds.png; those without the embodiment and one for each axis if empty.
+      out: folder for the PNG files.
+      size: side of each picture in pixels.
+      seed: of the scene, the same in every column.
+    """
+
+    tasks: tuple[str, ...] = ()
+    robots: tuple[str, ...] = ()
+    domains: tuple[str, ...] = ()
+    out: Path = Path("docs/images")
+    size: int = 192
+    seed: int = 0
+
+
+class ShowError(ValueError):
+    """A command that cannot be run."""
+
+
+def checked(config: ShowConfig) -> ShowConfig:
+    """`config` with every list filled in.
+
+    Raises:
+      ShowError: an unknown task, robot or domain (the message lists the known ones), or a size of
+        no pixels.
+    """
+    for kind, names, known in (
+        ("task", config.tasks, registry.TASKS),
+        ("robot", config.robots, registry.ROBOTS),
+    ):
+        for name in names:
+            if name not in known:
+                raise ShowError(f"unknown {kind} {name!r}; known: {', '.join(known)}")
+    for domain in config.domains:
+        try:
+            if shifts.other_robot(domain):
+                raise ShowError(f"domain {domain!r}: here the robots are rows; see --robots")
+        except ValueError as error:
+            raise ShowError(str(error)) from error
+    if config.size < 16:
+        raise ShowError(f"expected pictures of at least 16 pixels, got --size {config.size}")
+    return dataclasses.replace(
+        config,
+        tasks=config.tasks or tuple(registry.TASKS),
+        robots=config.robots or tuple(registry.ROBOTS),
+        domains=config.domains or DOMAINS,
+    )
+
+
+# -- one world -------------------------------------------------------------------------------------
+
+
+class Studio:
+    """Takes pictures of one task on one robot.
+
+    Args:
+      env: the environment.
+      worlds: pictures taken at once.
+      size: their side in pixels.
+    """
+
+    def __init__(self, env: Env, worlds: int, size: int) -> None:
+        self.env, self.runner = env, Runner(env, worlds)
+        self._spec = AlignSpec(crop=env.task.crop, offset=(0, 40), size=_WINDOW)
+
+        def picture(state: State, params: EnvParams) -> jax.Array:
+            rgb = env.render(state, params, size).rgb
+            assert rgb is not None
+            return rgb
+
+        self._picture = jax.jit(jax.vmap(picture))
+
+    def starts(
+        self, seed: int, params: Sequence[EnvParams], *, windows: bool = False
+    ) -> list[figures.ImageArray]:
+        """The start of one and the same scene under each of `params`.
+
+        Args:
+          seed: of the scene.
+          params: of one world each.
+          windows: whether to show what a policy sees, with its overlay, instead of the frame.
+        """
+        worlds, taken = self.runner.worlds, []
+        keys = jnp.broadcast_to(jax.random.key(seed), (worlds,))
+        for batch in _batches(params, worlds):
+            stacked = _stack(batch)
+            state = self.runner.reset(keys, stacked)
+            if windows:
+                images = self.runner.observe(state, stacked, self._spec).image
+            else:
+                images = self._picture(state, stacked)
+            taken += list(np.asarray(images))
+        return taken[: len(params)]
+
+    def expert(self, seed: int) -> tuple[list[figures.ImageArray], list[str]]:
+        """Pictures of an episode of the expert in the training region, and what they show.
+
+        Of the episodes that it tries, the first one solved.
+        """
+        worlds, runner = self.runner.worlds, self.runner
+        params = _stack([self.env.default_params()] * worlds)
+        state = runner.reset(jax.random.split(jax.random.key(seed), worlds), params)
+        states = [state]
+        for _ in range(self.env.task.horizon):
+            state = runner.step(state, runner.expert(state), params)
+            states.append(state)
+            if bool(np.all(state.success | state.nan)):
+                break
+        world = int(np.argmax(np.asarray(state.success & ~state.nan)))
+        success = [bool(state.success[world]) for state in states]
+        end = success.index(True) if any(success) else len(states) - 1
+        stage = [int(state.stage[world]) for state in states[: end + 1]]
+        steps, labels = moments(stage, self.env.task.stages)
+        taken = []
+        for batch in _batches(steps, worlds):
+            rows = [jax.tree.map(lambda leaf: leaf[world], states[step]) for step in batch]
+            taken += list(np.asarray(self._picture(_stack(rows), params)))
+        return taken[: len(steps)], labels
+
+
+def moments(stage: Sequence[int], stages: Sequence[Stage]) -> tuple[list[int], list[str]]:
+    """Which steps of an episode to show, and what to call them.
+
+    The start, the last moment of every stage but the final one, the end; of a task with one stage
+    the middle instead.
+
+    Args:
+      stage: after each of the steps, the start first.
+      stages: the task's.
+    """
+    end = len(stage) - 1
+    if len(stages) == 1:
+        return [0, end // 2, end], ["start", "middle", "end"]
+    steps, labels = [0], ["start"]
+    counts = {True: 0, False: 0}
+    for index, part in enumerate(stages[:-1]):
+        counts[part.open_hand] += 1
+        if index + 1 in stage:
+            steps.append(stage.index(index + 1) - 1)
+            what = "picked" if part.open_hand else "placed"
+            labels.append(f"{what} {counts[part.open_hand]}")
+    return [*steps, end], [*labels, "end"]
+
+
+def _batches(items: Sequence[T], size: int) -> Iterator[list[T]]:
+    """Lists of `size`, the last one filled up with its last item."""
+    for first in range(0, len(items), size):
+        part = list(items[first : first + size])
+        yield part + part[-1:] * (size - len(part))
+
+
+def _stack(trees: Sequence[T]) -> T:
+    """Pytrees of one world as one with a leading axis."""
+    stacked: T = jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+    return stacked
+
+
+# -- the files -------------------------------------------------------------------------------------
+
+
+def show(config: ShowConfig, console: terminal.Console) -> list[Path]:
+    """Writes all of the pictures; returns their files. `config` is a `checked` one."""
+    rows: list[str] = []
+    starts: list[list[figures.ImageArray | None]] = []
+    files: list[Path] = []
+    total = len(config.tasks) * len(config.robots) + 1
+    with terminal.ProgressBar(console, total, "pictures", unit="world") as bar:
+        for task in config.tasks:
+            strips = {}
+            for robot in config.robots:
+                studio = Studio(registry.make(task, robot), len(config.domains), config.size)
+                params = studio.env.default_params()
+                shifted = [shifts.shifted(params, domain) for domain in config.domains]
+                starts.append([*studio.starts(config.seed, shifted)])
+                rows.append(f"{_words(task)}\n{robot}")
+                strips[robot] = studio.expert(config.seed)
+                if not files and robot == config.robots[0]:
+                    files.append(_axes(studio, config))
+                    bar.advance()
+                bar.advance()
+            files.append(_episodes(task, strips, config.out))
+    columns = [_words(domain) for domain in config.domains]
+    title = "One scene of every task on every robot (rows) under every shift (columns)"
+    figure = figures.picture_grid(starts, rows, columns, title=title)
+    return [figures.save(figure, config.out / "worlds.png"), *files]
+
+
+def _episodes(
+    task: str, strips: Mapping[str, tuple[list[figures.ImageArray], list[str]]], out: Path
+) -> Path:
+    """`TASK.png` from each robot's pictures and their labels."""
+    labels = max((labels for _, labels in strips.values()), key=len)
+    pictures = [
+        [taken[had.index(label)] if label in had else None for label in labels]
+        for taken, had in strips.values()
+    ]
+    title = f"{_words(task).capitalize()}: an episode of the scripted expert"
+    figure = figures.picture_grid(pictures, list(strips), labels, title=title)
+    return figures.save(figure, out / f"{task}.png")
+
+
+def _axes(studio: Studio, config: ShowConfig) -> Path:
+    """`axes.png`: one scene of one task at every strength of every single shift."""
+    pictures: list[list[figures.ImageArray | None]] = []
+    default = studio.env.default_params()
+    names = (*shifts.SHIFTS, *shifts.AXES)
+    for name in names:
+        low, high = shifts.strength_range(name)
+        allowed = [low <= strength <= high for strength in STRENGTHS]
+        params = [
+            shifts.shifted(default, name, strength=strength)
+            for strength, fits in zip(STRENGTHS, allowed, strict=True)
+            if fits
+        ]
+        taken = iter(studio.starts(config.seed, params, windows=name.startswith(_CALIBRATION)))
+        pictures.append([next(taken) if fits else None for fits in allowed])
+    task = _words(studio.env.task.name)
+    figure = figures.picture_grid(
+        pictures,
+        [_words(name) for name in names],
+        [f"{strength:+g}" if strength else "0" for strength in STRENGTHS],
+        title=f"Every single shift by strength: one scene of {task}, {studio.env.robot.name}\n"
+        "(calibration: the policy's window with its overlay)",
+    )
+    return figures.save(figure, config.out / "axes.png")
+
+
+def _words(name: str) -> str:
+    """`in_domain` -> `in domain`, `a+b` in two lines."""
+    return name.replace("_", " ").replace("+", " +\n")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns the exit code."""
+    config = tyro.cli(ShowConfig, args=argv, prog="python -m palm_jax show")
+    console = terminal.make_console()
+    try:
+        for file in show(checked(config), console):
+            console.print(str(file), markup=False)
+    except (ShowError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
