@@ -1,7 +1,9 @@
 """Bulk episodes: the two executions agree, nothing is compiled twice, and the contract holds."""
 
 import dataclasses
+from collections import Counter
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -116,16 +118,19 @@ def test_all_domains_compile_each_piece_once(monkeypatch: pytest.MonkeyPatch) ->
     for domain in (*shifts.DOMAINS, "workspace+lighting+distractors"):
         with compilations() as names:
             record = evaluator.domain(policy, domain, seed=0, count=count, aligned=True)
-        pieces = [name for name in names if name in PIECES]
+        pieces = Counter(name for name in names if name in PIECES)
         robot = shifts.other_robot(domain)
-        assert len(pieces) == len(set(pieces)) and (robot not in robots or not pieces), pieces
+        # The policy is compiled once for both robots.
+        most = Counter({**dict.fromkeys(PIECES, 1), "act": 1 if robots else 2})
+        assert pieces <= most and (robot not in robots or not pieces), pieces
         robots.add(robot)
         assert record.success.shape == (count,) and not record.nan.any()
         assert (record.length == 3).all() and (record.draws >= 1).all()
     assert robots == {False, True}
 
 
-PIECES = {"step", "place", "locate", "reposition", "observe", "act"}
+PIECES = {"place", "locate", "reposition", "observe", "act"}
+"""Names of what is compiled; both the environment's step and the policy are an `act`."""
 
 
 @pytest.mark.parametrize("task", worlds.TASKS)
@@ -145,6 +150,7 @@ class Toy:
     """The smallest environment that keeps the contract; `fault` breaks one promise."""
 
     action_size = 10
+    task = SimpleNamespace(stages=("the only one",))
 
     def __init__(self, fault: str = "") -> None:
         self.fault = fault
@@ -167,7 +173,9 @@ class Toy:
 
     restore = expert
 
-    def step(self, state: ToyState, action: jax.Array, params: jax.Array) -> ToyState:
+    jump = locate
+
+    def act(self, state: ToyState, action: jax.Array) -> ToyState:
         x = state.x + action[6:9]
         if self.fault == "nan":
             x = jnp.where(state.step == 2, jnp.nan, x)
@@ -187,7 +195,7 @@ class Forgetful(Runner):
 
     def __init__(self, env: Any, worlds: int) -> None:
         super().__init__(env, worlds)
-        self.step = lambda *arguments: jax.jit(jax.vmap(env.step))(*arguments)
+        self._act = lambda *arguments: jax.jit(jax.vmap(env.act))(*arguments)
 
 
 class Unseeded(Runner):
@@ -215,7 +223,7 @@ def test_pieces_are_counted_by_name() -> None:
         runner.step(state, jnp.zeros((4, 10)), params)
         runner.step(state, jnp.ones((4, 10)), params)
         runner.observe(state, params, SMALL)
-    assert sorted(name for name in names if name in PIECES) == sorted(PIECES - {"act"})
+    assert sorted(name for name in names if name in PIECES) == sorted(PIECES)
 
 
 def test_a_sound_toy_passes() -> None:
