@@ -16,14 +16,14 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
-from palm_jax._checks import is_concrete
+from palm_jax._checks import Vector, is_concrete
 from palm_jax.envs.params import MAX_DISTRACTORS, EnvParams, repeat_params
 from palm_jax.envs.params import TEST_HIGH as TEST_HIGH
 from palm_jax.envs.params import TEST_LOW as TEST_LOW
 
 Shift = Callable[..., EnvParams]
+Strength = float | jax.Array  # an array of shape []
 
 MAX_CAMERA_ANGLE = float(np.radians(30.0))
 """Largest turn of the camera about the workspace's vertical, as in the paper."""
@@ -43,7 +43,7 @@ _ROTATION = np.radians(3.0) / np.sqrt(3) * np.ones(3)
 _TRANSLATION = 0.03 / np.sqrt(3) * np.ones(3)
 
 
-def _towards(start: jax.Array, end: ArrayLike, strength: jax.Array) -> jax.Array:
+def _towards(start: jax.Array, end: Vector, strength: Strength) -> jax.Array:
     """`start` at strength 0, bit for bit; `end` at strength 1."""
     return start + strength * (jnp.asarray(end, jnp.float32) - start)
 
@@ -51,7 +51,7 @@ def _towards(start: jax.Array, end: ArrayLike, strength: jax.Array) -> jax.Array
 # -- what widens -----------------------------------------------------------------------------------
 
 
-def workspace(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
+def workspace(params: EnvParams, *, strength: Strength = 1.0) -> EnvParams:
     """The target, and all other objects, anywhere in the test region: seven times the training
     region's area."""
     strength = _checked(workspace, strength)
@@ -64,24 +64,24 @@ def workspace(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
     )
 
 
-def viewpoint(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
+def viewpoint(params: EnvParams, *, strength: Strength = 1.0) -> EnvParams:
     """The camera turned by up to 30 degrees either way about the workspace centre."""
     strength = _checked(viewpoint, strength)
-    bounds = jnp.array([-MAX_CAMERA_ANGLE, MAX_CAMERA_ANGLE])
+    bounds = (-MAX_CAMERA_ANGLE, MAX_CAMERA_ANGLE)
     return dataclasses.replace(params, camera_angle=_towards(params.camera_angle, bounds, strength))
 
 
-def viewpoint_cone(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
+def viewpoint_cone(params: EnvParams, *, strength: Strength = 1.0) -> EnvParams:
     """`viewpoint`, and the camera 0.8 to 1.2 times as far from the workspace centre."""
     strength = _checked(viewpoint_cone, strength)
-    radius = _towards(params.camera_radius, jnp.array(RADIUS_RANGE), strength)
+    radius = _towards(params.camera_radius, RADIUS_RANGE, strength)
     return dataclasses.replace(viewpoint(params, strength=strength), camera_radius=radius)
 
 
 # -- axes ------------------------------------------------------------------------------------------
 
 
-def lighting(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
+def lighting(params: EnvParams, *, strength: Strength = 1.0) -> EnvParams:
     """Lights and ambient light half (-1) to one and a half times (1) as bright, and the lights
     turned by up to 60 degrees about the vertical: what is dim comes from one side, what is bright
     from the other."""
@@ -97,7 +97,7 @@ def lighting(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
     )
 
 
-def table_texture(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
+def table_texture(params: EnvParams, *, strength: Strength = 1.0) -> EnvParams:
     """The table top from dark blue-grey with planks half as wide (-1) to nearly white with planks
     twice as wide (1)."""
     strength = _checked(table_texture, strength)
@@ -110,26 +110,26 @@ def table_texture(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
     )
 
 
-def object_color(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
+def object_color(params: EnvParams, *, strength: Strength = 1.0) -> EnvParams:
     """Hues of the task's objects turned by up to 120 degrees either way; brightness stays."""
     strength = _checked(object_color, strength)
     return dataclasses.replace(params, object_hue=params.object_hue + _HUE * strength)
 
 
-def field_of_view(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
+def field_of_view(params: EnvParams, *, strength: Strength = 1.0) -> EnvParams:
     """The camera's field of view 20 % narrower (-1: all is larger) to 20 % wider (1)."""
     strength = _checked(field_of_view, strength)
     return dataclasses.replace(params, camera_fovy=params.camera_fovy * (1.0 + _ZOOM * strength))
 
 
-def distractors(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
+def distractors(params: EnvParams, *, strength: Strength = 1.0) -> EnvParams:
     """Up to `MAX_DISTRACTORS` objects on the table that the task is not about; strength from 0."""
     strength = _checked(distractors, strength)
     count = jnp.round(_towards(params.distractors, MAX_DISTRACTORS, strength))
     return dataclasses.replace(params, distractors=count)
 
 
-def calibration_pixels(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
+def calibration_pixels(params: EnvParams, *, strength: Strength = 1.0) -> EnvParams:
     """The policy's camera off by up to 20 pixels of the 512 frame, right and down in equal parts
     (negative: left and up)."""
     strength = _checked(calibration_pixels, strength)
@@ -137,14 +137,14 @@ def calibration_pixels(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvPa
     return dataclasses.replace(params, calibration_pixels=off)
 
 
-def calibration_rotation(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
+def calibration_rotation(params: EnvParams, *, strength: Strength = 1.0) -> EnvParams:
     """The policy's camera off by up to 3 degrees: tilt, pan and roll in equal parts."""
     strength = _checked(calibration_rotation, strength)
     off = params.calibration_rotation + strength * jnp.asarray(_ROTATION, jnp.float32)
     return dataclasses.replace(params, calibration_rotation=off)
 
 
-def calibration_translation(params: EnvParams, *, strength: ArrayLike = 1.0) -> EnvParams:
+def calibration_translation(params: EnvParams, *, strength: Strength = 1.0) -> EnvParams:
     """The policy's camera off by up to 3 cm: right, down and forward in equal parts."""
     strength = _checked(calibration_translation, strength)
     off = params.calibration_translation + strength * jnp.asarray(_TRANSLATION, jnp.float32)
@@ -214,7 +214,7 @@ def strength_range(name: str) -> tuple[float, float]:
     return (0.0 if name in SHIFTS or name == distractors.__name__ else -1.0), 1.0
 
 
-def _checked(shift: Shift, strength: ArrayLike) -> jax.Array:
+def _checked(shift: Shift, strength: Strength) -> Strength:
     """`strength`, if it may be one of `shift`'s; traced strengths pass."""
     if is_concrete(strength):
         low, high = strength_range(shift.__name__)
@@ -224,7 +224,7 @@ def _checked(shift: Shift, strength: ArrayLike) -> jax.Array:
                 f"{shift.__name__}: expected a strength from {low:g} to {high:g}, got "
                 f"{value.tolist()}; several strengths at once are a jax.vmap"
             )
-    return jnp.asarray(strength, jnp.float32)
+    return strength
 
 
 def parts(domain: str) -> tuple[str, ...]:
@@ -254,7 +254,7 @@ def other_robot(domain: str) -> bool:
     return EMBODIMENT in parts(domain)
 
 
-def shifted(params: EnvParams, domain: str, *, strength: ArrayLike = 1.0) -> EnvParams:
+def shifted(params: EnvParams, domain: str, *, strength: Strength = 1.0) -> EnvParams:
     """`params` under a domain: `in_domain`, or names of `SHIFTS` and `AXES` joined by `+`.
 
     `embodiment` may be among the names and changes nothing here, see `other_robot`.

@@ -40,7 +40,7 @@ class DomainRecord:
     object_xy: NDArray[np.float32]  # [N, 2] metres, world: the target object at the start
     camera_angle: NDArray[np.float32]  # [N] radians about the workspace centre; 0 in training
     length: NDArray[np.int32]  # [N] control steps until success or the end
-    draws: NDArray[np.int32]  # [N] start poses drawn until one was in reach; 0: not recorded
+    draws: NDArray[np.int32]  # [N] start poses drawn, in all stages; 0: not recorded
 
     @property
     def episodes(self) -> int:

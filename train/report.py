@@ -275,21 +275,22 @@ def variant_notes(runs: Iterable[Run]) -> list[str]:
 
 
 def draw_notes(runs: Sequence[Run]) -> list[str]:
-    """How many start poses had to be drawn until the arm could reach one, where it was recorded."""
+    """How many start poses were drawn, which tells how often the arm could not reach one."""
     found: dict[str, list[int]] = {}
     for run in runs:
         for domain, record in run.episodes.items():
-            found.setdefault(paper.domain_key(domain), []).extend(record.draws[record.draws > 0])
-    again = {domain: draws for domain, draws in found.items() if draws and max(draws) > 1}
-    if not any(found.values()):
+            drawn = record.draws[record.draws > 0]  # 0: not recorded
+            if drawn.size:
+                found.setdefault(paper.domain_key(domain), []).extend(drawn)
+    if not found:
         return []
     numbers = ", ".join(
-        f"{paper.domain_label(d)} {np.mean(again[d]):.2f} (most {max(again[d])})"
-        for d in paper.ordered_domains(list(again))
+        f"{paper.domain_label(d)} {np.mean(found[d]):.2f} (most {max(found[d])})"
+        for d in paper.ordered_domains(list(found))
     )
     return [
-        "A start pose out of the arm's reach is drawn again. Mean number of draws: "
-        + (f"{numbers}; 1 in other domains." if again else "1 in every domain.")
+        "Start poses drawn per scene, one for each stage of the task that began and another "
+        f"wherever the arm could not reach it: {numbers}."
     ]
 
 

@@ -268,7 +268,8 @@ def _run(config: SweepConfig, console: Console) -> None:
         if world not in runners:
             runners[world] = Runners.of(stored.task, robot, stored.second_robot, asked.worlds)
         evaluator, policy = workspace.load_policy(folder, runners[world])
-        with terminal.ProgressBar(console, asked.episodes, f"sweep {evaluator.method.name}") as bar:
+        label = f"sweep {evaluator.method.name}"
+        with terminal.ProgressBar(console, asked.episodes, label, unit="episode") as bar:
             found = asked.run(
                 evaluator,
                 policy,

@@ -377,12 +377,11 @@ def test_distractors_stand_clear_of_the_task(task: str) -> None:
         assert (pos[shown, :2] >= shifts.TEST_LOW - 1e-6).all()
         assert (pos[shown, :2] <= shifts.TEST_HIGH + 1e-6).all()
         away = np.linalg.norm(pos[..., :2] - np.asarray(state.object_start)[:, None, :2], axis=-1)
-        assert away[shown].min() >= 0.10, away[shown].min()
-        assert (away[shown] >= TARGET_DISTANCE - 1e-6).mean() > 0.98
+        assert away[shown].min() >= TARGET_DISTANCE - 1e-6, away[shown].min()
         for world in np.flatnonzero(counts > 1):
             xy = pos[world, : counts[world], :2]
             gaps = np.linalg.norm(xy[:, None] - xy[None], axis=-1)[np.triu_indices(len(xy), 1)]
-            assert gaps.min() > 0.045, (seed, world)
+            assert gaps.min() > 0.06, (seed, world)
     # More of them leave the first ones, and everything else of the scene, where they were.
     full = runner._place(worlds.keys(7), worlds.params(runner.env, "workspace+distractors"))
     np.testing.assert_array_equal(np.asarray(full.data.xpos)[:, bodies][shown], pos[shown])
@@ -401,7 +400,7 @@ def test_distractors_are_seen_and_hide_little(world: tuple[State, EnvParams]) ->
         assert placed.seen.all()
         off = np.asarray(placed.located - placed.object_start[:, :2])
         error[domain] = np.linalg.norm(off, axis=-1)
-    assert error["workspace+distractors"].max() < 0.03
+    assert error["workspace+distractors"].max() < 0.02
     assert np.median(error["workspace+distractors"] - error["workspace"]) < 1e-3
 
 
