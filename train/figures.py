@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, MultipleLocator, NullLocator
 from numpy.typing import NDArray
 
 from palm_jax.train import paper
@@ -146,6 +146,7 @@ def _map_axes(axes: Axes, *, left: bool, bottom: bool = True) -> None:
     """Axes of a map as the front camera sees the table."""
     axes.set_aspect("equal")
     axes.invert_yaxis()
+    axes.yaxis.set_major_locator(MultipleLocator(0.1))
     axes.xaxis.set_major_formatter("{x:.1f}")
     axes.yaxis.set_major_formatter("{x:.1f}")
     if bottom:
@@ -225,7 +226,8 @@ def heatmaps(
     bar.outline.set_visible(False)  # type: ignore[operator]
     figure.supxlabel(
         "as the front camera sees the table: robot at the top, camera at the bottom"
-        "   ·   dashed: training region",
+        + ("\n" if columns == 1 else "   ·   ")
+        + "dashed: training region",
         fontsize=8,
         color=MUTED,
     )
