@@ -185,7 +185,7 @@ def line(task: str, robot: str, result: dict[str, Any]) -> str:
             f"{domain} {entry['solved']}/{entry['scenes']} "
             f"({steps['min']}-{steps['median']}-{steps['max']} steps, "
             f"C MuJoCo {other['both'] + other['only_c']}, drift "
-            f"{1e3 * other['drift_median_m']:.1f} to {1e3 * other['drift_worst_m']:.0f} mm, "
+            f"{1e3 * other['drift_median_m']:.1f} to {1e3 * other['drift_worst_m']:.1f} mm, "
             f"slip {1e3 * entry['largest_slip_m']:.1f} mm);"
         )
     parts += [f"{k} {result[k]['nan']} NaN;" for k in soundness.RANDOM if k in result]
