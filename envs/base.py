@@ -49,7 +49,7 @@ _SUBSTEPS = 10
 _AREA_MARGIN = 0.12  # other objects may stand this far outside the target's region, metres
 _MAX_DRAWS = 16  # start poses drawn before an episode is declared impossible
 _IN_REACH = 0.002  # metres and radians that a start pose may be off
-_STILL_SEEN = 0.7  # share of a target's mask below which its earlier sighting is trusted more
+_STILL_SEEN = 0.5  # share of a target's mask below which its earlier sighting is trusted more
 # Folded into a scene's key, so that one more draw leaves those that were there before unchanged.
 _RADIUS_DRAW, _DISTRACTOR_DRAW, _LAYOUT_DRAW, _LATER_DRAW = range(1, 5)
 CONTROL_RATE = 20.0

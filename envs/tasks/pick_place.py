@@ -48,7 +48,8 @@ class Item:
       precision: (metres, radians) from its place within which the expert goes down with it.
       placed_radius: horizontal distance from the goal's origin (metres) within which it is in its
         place...
-      placed_height: ...if its origin is at most this high above the table.
+      placed_height: ...if its origin is at most this high above the table...
+      placed_upright: ...and the cosine of its tilt at least this (-1: however it lies).
     """
 
     body: str
@@ -68,6 +69,7 @@ class Item:
     precision: tuple[float, float]
     placed_radius: float
     placed_height: float
+    placed_upright: float = -1.0
 
 
 def stages_of(items: Sequence[Item]) -> tuple[Stage, ...]:
@@ -131,7 +133,7 @@ class PickPlaceTask(Task):
         pads = [
             Contact(pad, geom, PAD_FRICTION, stiff=True) for pad in robot.pads for geom in grasped
         ]
-        rests = [Contact(*pair, OBJECT_FRICTION) for pair in self.supports]
+        rests = [Contact(*pair, OBJECT_FRICTION, stiff=True) for pair in self.supports]
         tips = [
             Contact(tip, geom, OBJECT_FRICTION, stiff=True)
             for tip in robot.tips
@@ -222,7 +224,8 @@ class PickPlaceTask(Task):
             offset = data.xpos[found.body] - data.xpos[found.goal]
             near = jnp.linalg.norm(offset[:2]) <= item.placed_radius
             low = data.xpos[found.body, 2] <= TABLE_HEIGHT + item.placed_height
-            result.append(near & low)
+            upright = data.xmat[found.body, 2, 2] >= item.placed_upright
+            result.append(near & low & upright)
         return jnp.stack(result)
 
     def next_stage(

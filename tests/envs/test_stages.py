@@ -144,7 +144,9 @@ def test_the_global_policy_is_called_at_each_change_of_stage(task: str, robot: s
             low, high = env.task.stages[stage].start_height
             at = position(task, robot, states, bodies[stage])[t, world]
             offset, height = tcp[t, world, :2, 3] - at[:2], tcp[t, world, 2, 3] - TABLE_HEIGHT
-            assert np.abs(offset).max() < 0.06 + LOCATED + 0.002
+            assert np.abs(tcp[t, world, :2, 3] - states.located[t, world]).max() < 0.062
+            if stage > states.stage[t - 1, world]:  # dropped behind the hand: it may be misjudged
+                assert np.abs(offset).max() < 0.06 + LOCATED + 0.002
             assert low - 0.002 < height < high + 0.002
             before = tcp[t - 1, world, :3, :3]
             assert np.abs(tcp[t, world, :3, :3] - before).max() < 0.12  # one step's turn
@@ -159,6 +161,14 @@ def test_the_global_policy_is_called_at_each_change_of_stage(task: str, robot: s
     assert count >= 0.9 * 3 * worlds.WORLDS * (len(bodies) - 1)
 
 
+def last_run(rows: np.ndarray, marked: np.ndarray) -> np.ndarray:
+    """The last of the stretches of `rows` that are `marked`: what was dropped before was picked
+    again."""
+    end = np.flatnonzero(marked)[-1] + 1
+    gaps = np.flatnonzero(~marked[:end])
+    return rows[gaps[-1] + 1 if len(gaps) else 0 : end]
+
+
 @cases
 def test_what_is_held_stays_in_the_hand(task: str, robot: str) -> None:
     """Less than 1 cm of slip from when it is lifted to when the hand opens, across the jump."""
@@ -171,12 +181,14 @@ def test_what_is_held_stays_in_the_hand(task: str, robot: str) -> None:
             inside = np.einsum("twji,twj->twi", tcp[..., :3, :3], at - tcp[..., :3, 3])
             for world, steps in enumerate(upto_success(states)):
                 rows = np.array(steps)
-                placing = states.stage[rows, world] == 2 * item + 1
-                held = rows[placing & (opening[rows, world] < opening[rows, world].min() + 0.9)]
-                held = held[opening[held, world] < opening[held, world].min() + 0.02]
-                if states.success[-1, world] and len(held):
-                    slip = np.linalg.norm(inside[held, world] - inside[held[0], world], axis=-1)
-                    assert slip.max() < 0.01, (body, world)
+                if not states.success[-1, world]:
+                    continue
+                placing = last_run(rows, states.stage[rows, world] == 2 * item + 1)
+                # An opening that changes is a hand that lets go, or one that lost what it held.
+                gripped = np.abs(opening[placing, world] - opening[placing[0], world]) < 0.02
+                held = placing[: np.argmin(np.append(gripped, False))]
+                slip = np.linalg.norm(inside[held, world] - inside[held[0], world], axis=-1)
+                assert slip.max() < 0.01, (body, world)
 
 
 @cases
