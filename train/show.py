@@ -170,6 +170,10 @@ class Studio:
             taken += list(np.asarray(self._picture(_stack(rows), params)))
         return taken[: len(steps)], labels
 
+    def close(self) -> None:
+        """Forgets all compiled programs, so that many worlds take no more memory than one."""
+        jax.clear_caches()
+
 
 def moments(stage: Sequence[int], stages: Sequence[Stage]) -> tuple[list[int], list[str]]:
     """Which steps of an episode to show, and what to call them.
@@ -229,6 +233,7 @@ def show(config: ShowConfig, console: terminal.Console) -> list[Path]:
                 if not files and robot == config.robots[0]:
                     files.append(_axes(studio, config))
                     bar.advance()
+                studio.close()
                 bar.advance()
             files.append(_episodes(task, strips, config.out))
     columns = [_words(domain) for domain in config.domains]
@@ -246,7 +251,7 @@ def _episodes(
         [taken[had.index(label)] if label in had else None for label in labels]
         for taken, had in strips.values()
     ]
-    title = f"{_words(task).capitalize()}: an episode of the scripted expert"
+    title = f"{_words(task).capitalize()}: the expert"
     figure = figures.picture_grid(pictures, list(strips), labels, title=title)
     return figures.save(figure, out / f"{task}.png")
 

@@ -73,6 +73,9 @@ class StubStudio:
     def expert(self, seed: int) -> tuple[list[np.ndarray], list[str]]:
         return [self.grey(50), self.grey(90), self.grey(130)], ["start", "middle", "end"]
 
+    def close(self) -> None:
+        pass
+
 
 def test_files(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
