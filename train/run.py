@@ -351,7 +351,7 @@ def _film_domain(
 
 def _sweeps(evaluators: dict[str, Evaluator], folders: dict[str, Path], console: Console) -> None:
     """A coarse sweep of every policy; `python -m palm_jax sweep RUN` makes finer ones."""
-    options = sweep.SweepConfig(run=Path())
+    options = sweep.SweepConfig(run=Path(), camera="-30:30:3")
     job = sweep.job(options)
     for name, folder in folders.items():
         path = records.sweep_path(folder)
