@@ -5,15 +5,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import worlds as compiled
 
 from palm_jax.__main__ import VERBS
+from palm_jax.envs import rollout
+from palm_jax.envs.base import Env, State
+from palm_jax.envs.rollout import Runner
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 
 
+def readme_code() -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+
+
 def test_the_readme_example_runs() -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    code, _ = readme_code()
     # A camera one metre above the table's centre that looks straight down; the hand below it.
     down = np.diag([1.0, -1.0, -1.0, 1.0])
     cam_to_world, tcp = down.copy(), down.copy()
@@ -31,6 +39,24 @@ def test_the_readme_example_runs() -> None:
     np.testing.assert_allclose(proprio, [1, 0, 0, 0, 1, 0, 0.9, 1], atol=1e-6)
     # The TCP's white dot: in the middle column of the crop, 40 of 200 pixels above the middle.
     assert (image[round((100 - 40) / 200 * 84), 42] == 255).all()
+
+
+def test_the_readme_worlds_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With fewer worlds: those that the other tests have compiled."""
+    _, code = readme_code()
+    asked = []
+
+    def runner(env: Env, worlds: int) -> Runner:
+        asked.append(worlds)
+        return compiled.runner(env.task.name, env.robot.name)
+
+    monkeypatch.setattr(rollout, "Runner", runner)
+    names: dict[str, object] = {}
+    exec(compile(code.replace("64", str(compiled.WORLDS)), "README.md", "exec"), names)
+    state = names["state"]
+    assert asked == [compiled.WORLDS] and isinstance(state, State)
+    assert (np.asarray(state.step) == 1).all() and state.step.shape == (compiled.WORLDS,)
+    assert np.ptp(np.asarray(names["params"].light_ambient)) > 0.1  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
