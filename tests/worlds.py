@@ -53,7 +53,8 @@ def expert_episodes(task: str, robot: str = "panda") -> tuple[State, ...]:
 
     An episode goes on after its success until all of its batch have ended.
     """
-    return _expert_episodes(task, robot, batches=3)
+    batches = 3 if len(runner(task, robot).env.task.stages) == 1 else 2
+    return _expert_episodes(task, robot, batches)
 
 
 @functools.cache

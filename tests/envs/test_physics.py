@@ -70,8 +70,9 @@ def test_one_step_is_mujocos(task: str) -> None:
         data = at(states, t)
         ours, *theirs = step(data)
         for reference in theirs:
-            np.testing.assert_array_equal(ours.qpos, reference.qpos)
-            np.testing.assert_array_equal(ours.qvel, reference.qvel)
+            # The same operations; the compiler may fuse them differently.
+            np.testing.assert_allclose(ours.qpos, reference.qpos, atol=1e-7)
+            np.testing.assert_allclose(ours.qvel, reference.qvel, atol=1e-5)
         open_gripper = states.data.ctrl[t + 1, :, -1] > 0.039
         for world in range(worlds.WORLDS):
             c = c_step(model, data, world)

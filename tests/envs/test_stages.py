@@ -92,7 +92,7 @@ def test_the_expert_solves_the_task_stage_by_stage(task: str, robot: str) -> Non
                 # Up by one at a time; a thing that slipped is picked again: down by one.
                 assert stage[-1] == last and set(np.diff(stage)) <= {-1, 0, 1}
                 solved += 1
-    assert solved >= 0.9 * 3 * worlds.WORLDS, solved
+    assert solved >= 0.9 * 2 * worlds.WORLDS, solved
 
 
 @cases
@@ -158,7 +158,7 @@ def test_the_global_policy_is_called_at_each_change_of_stage(task: str, robot: s
                 carried = position(task, robot, states, bodies[stage - 1])[t, world]
                 assert np.linalg.norm(carried - tcp[t, world, :3, 3]) < 0.03
             count += 1
-    assert count >= 0.9 * 3 * worlds.WORLDS * (len(bodies) - 1)
+    assert count >= 0.9 * 2 * worlds.WORLDS * (len(bodies) - 1)
 
 
 def last_run(rows: np.ndarray, marked: np.ndarray) -> np.ndarray:
