@@ -86,15 +86,17 @@ def _jump_if_asked(env: Env) -> Callable[[State, State, EnvParams], State]:
 def step_worlds(env: Env, state: State, action: jax.Array, params: EnvParams) -> State:
     """`Env.step` of W worlds in one jittable piece, for accelerators.
 
-    The global policy is a branch for the whole batch: taken only when a stage has changed in one
-    of its worlds.
-
     Args:
       env: the environment.
       state, params: leading axis [W].
       action: [W, 10].
     """
-    state = jax.vmap(env.act)(state, action)
+    return jump_worlds(env, jax.vmap(env.act)(state, action), params)
+
+
+def jump_worlds(env: Env, state: State, params: EnvParams) -> State:
+    """The global policy of W worlds where `State.jump` asks for it: a branch for the whole batch,
+    taken only when a stage has changed in one of its worlds."""
     if len(env.task.stages) == 1:
         return state
 
