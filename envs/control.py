@@ -166,6 +166,12 @@ def carried(motion: jax.Array, pose: jax.Array) -> jax.Array:
     return jnp.concatenate([motion[:3, :3] @ pose[:3] + motion[:3, 3], turned])
 
 
+def yaw_quaternion(yaw: jax.Array) -> jax.Array:
+    """Unit quaternion [4], w first, of a turn by `yaw` [] radians about z."""
+    zero = jnp.zeros(())
+    return jnp.stack([jnp.cos(yaw / 2), zero, zero, jnp.sin(yaw / 2)])
+
+
 def pointing_down(position: jax.Array, yaw: jax.Array) -> jax.Array:
     """TCP pose [4, 4] at `position` [3], approaching straight down, x axis at `yaw` []."""
     cos, sin, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros(())

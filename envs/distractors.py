@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from palm_jax.envs.control import yaw_quaternion
 from palm_jax.envs.params import EnvParams
 from palm_jax.envs.tasks.base import TABLE_HEIGHT
 from palm_jax.envs.world import DISTRACTORS
@@ -84,7 +85,7 @@ class Distractors:
             yaw = jax.random.uniform(yaw_key, (), minval=-jnp.pi, maxval=jnp.pi)
             shown = index < params.distractors
             at = jnp.append(xy, TABLE_HEIGHT)
-            turn = jnp.stack([jnp.cos(yaw / 2), jnp.zeros(()), jnp.zeros(()), jnp.sin(yaw / 2)])
+            turn = yaw_quaternion(yaw)
             pos.append(jnp.where(shown, at, parked.pos[index]))
             quat.append(jnp.where(shown, turn, parked.quat[index]))
             taken = jnp.concatenate([taken, xy[None]])

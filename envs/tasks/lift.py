@@ -8,13 +8,12 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
+from palm_jax.envs.control import yaw_quaternion
 from palm_jax.envs.robots import Robot
 from palm_jax.envs.tasks.base import Command, Placement, Task
+from palm_jax.envs.tasks.fingers import OBJECT_FRICTION, pad_contacts, tip_contacts
 from palm_jax.envs.tasks.skills import Hold, both_touch, hold, pick, turn_to
 from palm_jax.envs.world import Contact
-
-PAD_FRICTION = 1.5
-OBJECT_FRICTION = 0.3  # metal or plastic on wood: a finger that arrives first shifts the object
 
 
 class LiftIds(NamedTuple):
@@ -60,15 +59,9 @@ class LiftTask(Task):
     period: float | None
 
     def contacts(self, robot: Robot) -> tuple[Contact, ...]:
-        pads = [Contact(pad, self.grasp_geom, PAD_FRICTION, stiff=True) for pad in robot.pads]
         rests = [Contact(*pair, OBJECT_FRICTION) for pair in self.supports]
-        obstacles = ("table", *self.tip_obstacles)
-        tips = [
-            Contact(tip, geom, OBJECT_FRICTION, stiff=True)
-            for tip in robot.tips
-            for geom in obstacles
-        ]
-        return (*pads, *rests, *tips)
+        pads = pad_contacts(robot, (self.grasp_geom,))
+        return (*pads, *rests, *tip_contacts(robot, self.tip_obstacles))
 
     def bind(self, model: mujoco.MjModel, robot: Robot) -> LiftIds:
         body = model.body(self.body).id
@@ -92,7 +85,7 @@ class LiftTask(Task):
         area: jax.Array,
     ) -> Placement:
         del key, area  # there is nothing but the target
-        quat = jnp.stack([jnp.cos(yaw / 2), jnp.zeros(()), jnp.zeros(()), jnp.sin(yaw / 2)])
+        quat = yaw_quaternion(yaw)
         pose = jnp.concatenate([xy, jnp.array([self.rest_height]), quat])
         under = [jnp.concatenate([xy, jnp.array([height])]) for _, height in self.mocap]
         return Placement(

@@ -15,9 +15,10 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from palm_jax.envs.control import yaw_quaternion
 from palm_jax.envs.robots import Robot
 from palm_jax.envs.tasks.base import TABLE_HEIGHT, Command, Placement, Stage, Task
-from palm_jax.envs.tasks.lift import OBJECT_FRICTION, PAD_FRICTION
+from palm_jax.envs.tasks.fingers import OBJECT_FRICTION, pad_contacts, tip_contacts
 from palm_jax.envs.tasks.skills import Hold, both_touch, hold, pick, put, turn_to
 from palm_jax.envs.world import Contact
 
@@ -130,16 +131,9 @@ class PickPlaceTask(Task):
 
     def contacts(self, robot: Robot) -> tuple[Contact, ...]:
         grasped = tuple(item.grasp_geom for item in self.items)
-        pads = [
-            Contact(pad, geom, PAD_FRICTION, stiff=True) for pad in robot.pads for geom in grasped
-        ]
         rests = [Contact(*pair, OBJECT_FRICTION, stiff=True) for pair in self.supports]
-        tips = [
-            Contact(tip, geom, OBJECT_FRICTION, stiff=True)
-            for tip in robot.tips
-            for geom in ("table", *grasped, *self.tip_obstacles)
-        ]
-        return (*pads, *rests, *tips)
+        tips = tip_contacts(robot, (*grasped, *self.tip_obstacles))
+        return (*pad_contacts(robot, grasped), *rests, *tips)
 
     def bind(self, model: mujoco.MjModel, robot: Robot) -> PickPlaceIds:
         left, right = (model.geom(name).id for name in robot.pads)
@@ -176,14 +170,14 @@ class PickPlaceTask(Task):
         yaws = jnp.append(yaw, turns[:others])
         for item, found, at, turn in zip(self.items, ids.items, where, yaws, strict=False):
             height = jnp.array([TABLE_HEIGHT + item.rest_height])
-            pose = jnp.concatenate([at, height, _yaw_quat(turn)])
+            pose = jnp.concatenate([at, height, yaw_quaternion(turn)])
             qpos = jax.lax.dynamic_update_slice(qpos, pose, (found.qpos,))
         marks = where[len(self.items) :]
         spins = jnp.where(jnp.asarray(self.spins), turns[others:], 0.0)
         return Placement(
             qpos=qpos,
             mocap_pos=jnp.column_stack([marks, jnp.full(len(marks), TABLE_HEIGHT)]),
-            mocap_quat=jax.vmap(_yaw_quat)(spins),
+            mocap_quat=jax.vmap(yaw_quaternion)(spins),
         )
 
     def _layout(self, key: jax.Array, xy: jax.Array, area: jax.Array) -> jax.Array:
@@ -306,9 +300,3 @@ class PickPlaceTask(Task):
             radius=radius,
             angle=angle,
         )
-
-
-def _yaw_quat(yaw: jax.Array) -> jax.Array:
-    """Unit quaternion [4] of a turn about z."""
-    zero = jnp.zeros(())
-    return jnp.stack([jnp.cos(yaw / 2), zero, zero, jnp.sin(yaw / 2)])
