@@ -6,6 +6,7 @@ VENV ?= .venv
 DEMO_ARGS ?= --preset quick --out runs/demo
 BENCH_ARGS ?=
 PYTEST_ARGS ?=
+TEST_JOBS ?= 2
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
@@ -52,7 +53,7 @@ lint: $(VENV)/.test
 	$(BIN)/mypy -p palm_jax
 
 test: lint
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses $(TEST_JOBS) --dist loadgroup $(PYTEST_ARGS)
 
 # The import comes first because the tests skip themselves without the package.
 test-playground: $(VENV)/.playground

@@ -450,7 +450,8 @@ class Env:
         command = self.task.expert(
             self._ids, state.data, tcp, self.opening(state), state.object_start, state.stage
         )
-        delta = encode_delta(tcp, control.step_towards(tcp, command.target))
+        towards = control.step_towards(tcp, command.target, max_distance=self.task.pace)
+        delta = encode_delta(tcp, towards)
         return jnp.append(delta, command.gripper)
 
     # -- observation -------------------------------------------------------------------------------

@@ -7,6 +7,9 @@ Two facts of XLA's CPU backend shape this file (figures in docs/performance.md):
   other jits (`jit_physics` is for physics alone);
 * inside `lax.scan`, fusions recompute kinematics across MJX's stages unless an optimisation
   barrier stands between them.
+
+And one of jaxlib's LAPACK calls, which wait inside the thread pool that they hand their work to:
+as many of them at a time as there are threads wait for ever (`_after_the_solver`).
 """
 
 from collections.abc import Callable
@@ -32,6 +35,19 @@ def jit_physics(function: Callable[..., Any], **options: Any) -> Callable[..., A
     return jax.jit(function, compiler_options=compiler_options(), **options)
 
 
+def _after_the_solver(data: mjx.Data) -> mjx.Data:
+    """`data` with an inertia matrix that cannot be factorised before the solver has ended.
+
+    `mjx.implicit` factorises the mass matrix, the solver factorises its Hessian, and neither needs
+    the other: XLA runs both at once. With two threads and a batch that LAPACK divides among threads
+    (128 worlds of 21 degrees of freedom) each then holds one thread and waits for the other. The
+    zero, which XLA does not fold (it may be NaN), puts them in order; barriers do not, as they are
+    gone when thunks are scheduled.
+    """
+    zero = 0.0 * jnp.sum(data.qacc)
+    return data.tree_replace({"_impl.M": data._impl.M + zero})
+
+
 _STAGES: tuple[Callable[[mjx.Model, mjx.Data], mjx.Data], ...] = (
     mjx.kinematics,
     mjx.com_pos,
@@ -44,6 +60,7 @@ _STAGES: tuple[Callable[[mjx.Model, mjx.Data], mjx.Data], ...] = (
     mjx.fwd_actuation,
     mjx.fwd_acceleration,
     mjx.solve,
+    lambda _, data: _after_the_solver(data),
     mjx.implicit,
 )
 

@@ -5,6 +5,7 @@ folder, or to an empty string to compile everything anew.
 """
 
 import os
+from pathlib import Path
 
 # Before anything imports matplotlib: figures are drawn to files.
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -34,3 +35,17 @@ def pytest_configure(config: pytest.Config) -> None:
     if folder:
         jax.config.update("jax_compilation_cache_dir", folder)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_CACHING)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Which tests share a process (`--dist loadgroup`): those of a file; and those that share
+    worlds, which take longer to compile than all else and would be compiled in both processes."""
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group(_process(item.path)))
+
+
+def _process(file: Path) -> str:
+    if file.name in ("test_stages.py", "test_docs.py"):
+        return "stages"
+    return "envs" if file.parent.name == "envs" else str(file)

@@ -137,10 +137,7 @@ def test_the_expert_solves_the_task(task: str, robot: str) -> None:
 
 @cases
 def test_a_held_object_does_not_slip(task: str, robot: str) -> None:
-    """Less than 1 cm in the hand, from the moment it leaves its support until it is solved.
-
-    One in 48 cans was measured to slip by 10.4 mm on the Panda.
-    """
+    """Less than 1 cm in the hand, from the moment it leaves its support until it is solved."""
     env, slips = worlds.runner(task, robot).env, []
     for states in worlds.expert_episodes(task, robot):
         tcp, body = worlds.tcp(env, states), states.data.xpos[:, :, env._ids.body]
@@ -150,7 +147,7 @@ def test_a_held_object_does_not_slip(task: str, robot: str) -> None:
         for world in np.flatnonzero(states.success[-1]):
             held = inside[: end[world], world][risen[: end[world], world]]
             slips.append(np.linalg.norm(held - held[0], axis=-1).max())
-    assert max(slips) < 0.0115 and np.quantile(slips, 0.95) < 0.01, np.quantile(slips, [0.5, 1])
+    assert max(slips) < 0.01, np.quantile(slips, [0.5, 0.95, 1])
 
 
 @cases

@@ -1,5 +1,8 @@
 """MJX against C MuJoCo and against `mjx.step`, on states along the expert's episodes."""
 
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -118,3 +121,12 @@ def test_only_listed_pairs_touch() -> None:
         assert not env.mj_model.geom_contype.any() and not env.mj_model.geom_conaffinity.any()
         assert env.mj_model.npair == len(env.task.contacts(env.robot))
         assert env.mj_model.opt.timestep == 0.005
+
+
+def test_many_worlds_of_many_bodies_end() -> None:
+    """Two factorisations at once waited for each other on two cores, for ever."""
+    script = Path(__file__).with_name("many_worlds.py")
+    done = subprocess.run(
+        [sys.executable, str(script)], check=True, timeout=120, stdout=subprocess.PIPE, text=True
+    )
+    assert done.stdout.splitlines()[-1] == "True"  # MJX talks before that
