@@ -53,7 +53,7 @@ lint: $(VENV)/.test
 	$(BIN)/mypy -p palm_jax
 
 test: lint
-	$(BIN)/python -m pytest --numprocesses $(TEST_JOBS) --dist loadgroup $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses $(TEST_JOBS) --dist loadscope $(PYTEST_ARGS)
 
 # The import comes first because the tests skip themselves without the package.
 test-playground: $(VENV)/.playground

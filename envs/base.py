@@ -450,8 +450,7 @@ class Env:
         command = self.task.expert(
             self._ids, state.data, tcp, self.opening(state), state.object_start, state.stage
         )
-        towards = control.step_towards(tcp, command.target, max_distance=self.task.pace)
-        delta = encode_delta(tcp, towards)
+        delta = encode_delta(tcp, control.step_towards(tcp, command.target))
         return jnp.append(delta, command.gripper)
 
     # -- observation -------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ folder, or to an empty string to compile everything anew.
 
 import os
 from pathlib import Path
+from typing import Any
 
 # Before anything imports matplotlib: figures are drawn to files.
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -13,6 +14,7 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 import hypothesis
 import jax
 import pytest
+from xdist.scheduler import LoadScopeScheduling
 
 # Seconds of compilation above which a program is worth a file.
 WORTH_CACHING = 0.3
@@ -37,15 +39,17 @@ def pytest_configure(config: pytest.Config) -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_CACHING)
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Which tests share a process (`--dist loadgroup`): those of a file; and those that share
-    worlds, which take longer to compile than all else and would be compiled in both processes."""
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group(_process(item.path)))
+class Processes(LoadScopeScheduling):
+    """Which tests share a process: those of a file; and those of files that share worlds, which
+    take longer to compile than all else and would be compiled in both processes."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        file = Path(nodeid.split("::")[0])
+        if file.name in ("test_stages.py", "test_docs.py"):
+            return "stages"
+        return "envs" if file.parent.name == "envs" else str(file)
 
 
-def _process(file: Path) -> str:
-    if file.name in ("test_stages.py", "test_docs.py"):
-        return "stages"
-    return "envs" if file.parent.name == "envs" else str(file)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadScopeScheduling:
+    """For `--dist loadscope` and the like."""
+    return Processes(config, log)

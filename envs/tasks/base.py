@@ -63,7 +63,6 @@ class Task(abc.ABC):
       crop: side of the TCP crop in pixels of the paper's 512-pixel frame.
       horizon: control steps after which an episode has failed.
       robot_visible: whether the robot is drawn (physics is the same).
-      pace: largest way of the TCP (metres) that the scripted expert commands in one control step.
     """
 
     name: str
@@ -73,7 +72,6 @@ class Task(abc.ABC):
     crop: int
     horizon: int
     robot_visible: bool = dataclasses.field(default=True, kw_only=True)
-    pace: float = dataclasses.field(default=0.006, kw_only=True)
 
     @abc.abstractmethod
     def contacts(self, robot: Robot) -> tuple[Contact, ...]:

@@ -57,7 +57,6 @@ class LiftTask(Task):
     lift_height: float
     lateral_limit: float
     period: float | None
-    pace: float = dataclasses.field(default=0.0047, kw_only=True)  # episodes of 40 steps and more
 
     def contacts(self, robot: Robot) -> tuple[Contact, ...]:
         rests = [Contact(*pair, OBJECT_FRICTION) for pair in self.supports]

@@ -20,9 +20,8 @@ _CLOSE_ANGLE = 0.25
 # fingers pass the object: the hand goes all the way down and is put right there.
 _FUNNEL_RADIUS = 0.009
 _FUNNEL_ANGLE = 0.06
-# The lift begins slowly: fingers that have yet to close fully do not slide off.
-_LIFT_SPEED = 0.004  # metres of the first control step
-_LIFT_GAIN = 0.3  # metres a step, per metre risen
+# Fingers that have yet to close fully do not slide off at this speed, and lifts take forty steps.
+_LIFT_SPEED = 0.004  # metres in a control step
 _HOLDING_MARGIN = 0.08  # of opening, above the width of the object: from there on the lift begins
 _LIFT_MARGIN = 0.03  # the expert heads for a point this far beyond the height that counts as solved
 _FUNNEL_SLOPE = 3.0  # metres of extra height per metre of lateral error
@@ -75,8 +74,7 @@ def pick(
     )
     closing = opening < hold.closing
     holding = closing & (opening < hold.holding)
-    speed = _LIFT_SPEED + _LIFT_GAIN * jnp.maximum(tcp[2, 3] - bottom, 0.0)
-    lifted = jnp.minimum(bottom + rise + _LIFT_MARGIN, tcp[2, 3] + speed / STEP_GAIN)
+    lifted = jnp.minimum(bottom + rise + _LIFT_MARGIN, tcp[2, 3] + _LIFT_SPEED / STEP_GAIN)
     reach = jnp.concatenate([grasp[:2], (grasp[2] + above)[None]])
     up = jnp.concatenate([tcp[:2, 3], lifted[None]])
     stay = jnp.concatenate([tcp[:2, 3], grasp[2:]])

@@ -100,13 +100,12 @@ def test_reloaded_demonstrations_are_consistent(recorded: Path) -> None:
     np.testing.assert_allclose(np.linalg.norm(columns, axis=-1), 1, atol=1e-5)
     np.testing.assert_allclose((columns[:, 0] * columns[:, 1]).sum(-1), 0, atol=1e-5)
     assert set(np.unique(found.actions[:, 9])) == {0.0, 1.0}
-    assert np.linalg.norm(found.actions[:, 6:9], axis=-1).max() <= 0.0047 + 1e-5
-    # Labels point where the hand then went: the motion is the command plus a disturbance of the
-    # same size.
+    assert np.linalg.norm(found.actions[:, 6:9], axis=-1).max() <= 0.006 + 1e-5
+    # Labels point where the hand then went: the motion is the command plus the disturbance.
     same = np.flatnonzero(np.diff(found.episode) == 0)
     moved = np.array([delta(found.tcp[i], found.tcp[i + 1])[6:9] for i in same])
     command = found.actions[same, 6:9]
-    assert np.corrcoef(moved.ravel(), command.ravel())[0, 1] > 0.4
+    assert np.corrcoef(moved.ravel(), command.ravel())[0, 1] > 0.5
     assert np.linalg.norm(moved - command, axis=-1).mean() < 0.012
 
 
