@@ -136,17 +136,17 @@ def test_the_global_policy_is_called_at_each_change_of_stage(task: str, robot: s
     """The hand is near the next target, at the stage's height, turned as before and at rest."""
     env = worlds.runner(task, robot).env
     bodies = [body for pair in ITEMS[task] for body in pair]
-    count = 0
+    count, errors = 0, []
     for states in worlds.expert_episodes(task, robot):
         tcp = worlds.tcp(env, states)
         for t, world in changes(states):
             stage = int(states.stage[t, world])
             low, high = env.task.stages[stage].start_height
             at = position(task, robot, states, bodies[stage])[t, world]
-            offset, height = tcp[t, world, :2, 3] - at[:2], tcp[t, world, 2, 3] - TABLE_HEIGHT
+            height = tcp[t, world, 2, 3] - TABLE_HEIGHT
             assert np.abs(tcp[t, world, :2, 3] - states.located[t, world]).max() < 0.062
             if stage > states.stage[t - 1, world]:  # dropped behind the hand: it may be misjudged
-                assert np.abs(offset).max() < 0.06 + LOCATED + 0.002
+                errors.append(np.abs(states.located[t, world] - at[:2]).max())
             assert low - 0.002 < height < high + 0.002
             before = tcp[t - 1, world, :3, :3]
             assert np.abs(tcp[t, world, :3, :3] - before).max() < 0.12  # one step's turn
@@ -158,6 +158,8 @@ def test_the_global_policy_is_called_at_each_change_of_stage(task: str, robot: s
                 carried = position(task, robot, states, bodies[stage - 1])[t, world]
                 assert np.linalg.norm(carried - tcp[t, world, :3, 3]) < 0.03
             count += 1
+    # Of some targets the hand, or what it holds, hides a part.
+    assert np.quantile(errors, 0.8) < LOCATED and max(errors) < 2 * LOCATED, sorted(errors)[-5:]
     assert count >= 0.9 * 2 * worlds.WORLDS * (len(bodies) - 1)
 
 
