@@ -2,8 +2,8 @@
 
 `bench worlds` has its own options, see `benchmarks.bench_worlds`.
 
-Prints one JSON: `palm_jax` has the headline figure of each benchmark that ran, `details` all that
-was measured, the rest on what and when.
+Prints one JSON: `palm_jax` has the headline figure of each benchmark that ran, every other package
+that was measured beside it has its own, `details` all that was measured, the rest on what and when.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from benchmarks import common
 class Benchmark(NamedTuple):
     """One benchmark: its modules, each with `run() -> dict`, and the key of its headline figure."""
 
-    modules: tuple[str, ...]  # the headline is of the first
+    modules: tuple[str, ...]  # the headline is of the first, and so are `peers`: that of others
     headline: str
 
 
@@ -43,9 +43,37 @@ def collect(names: Sequence[str]) -> dict[str, Any]:
             start = time.perf_counter()
             found[module] = importlib.import_module(f"benchmarks.{module}").run()
             print(f"  {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
-        result["palm_jax"][benchmark.headline] = found[benchmark.modules[0]][benchmark.headline]
+        first = found[benchmark.modules[0]]
+        result["palm_jax"][benchmark.headline] = first[benchmark.headline]
+        for package, figures in first.get("peers", {}).items():
+            result.setdefault(package, {}).update(figures)
         result["details"][name] = found
     return result
+
+
+def table(result: dict[str, Any]) -> str:
+    """The headline figures for people: a row each, a column for each package."""
+    headlines = [b.headline for b in BENCHMARKS.values() if b.headline in result["palm_jax"]]
+    packages = [
+        name
+        for name, figures in result.items()
+        if isinstance(figures, dict) and any(headline in figures for headline in headlines)
+    ]
+    rows = [["", *packages]]
+    for headline in headlines:
+        figures = [result[package].get(headline) for package in packages]
+        rows.append(
+            [headline.replace("_", " ")] + ["-" if f is None else f"{f:,.0f}" for f in figures]
+        )
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = [
+        "  ".join(
+            [row[0].ljust(widths[0])]
+            + [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
+        )
+        for row in rows
+    ]
+    return "\n".join(lines)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -72,6 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     result = collect(list(BENCHMARKS) if "all" in names else list(dict.fromkeys(names)))
     common.publish(result, options.json)
+    print(table(result), file=sys.stderr)
     return 0
 
 

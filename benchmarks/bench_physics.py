@@ -1,5 +1,5 @@
-"""Physics steps of 5 ms a second: MJX as the environments run it, and C MuJoCo beside it; and how
-long an environment takes to compile."""
+"""Physics steps of 5 ms a second: MJX as the environments run it, C MuJoCo and plain MJX beside it;
+and how long an environment takes to compile."""
 
 import json
 import os
@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import mujoco
 import numpy as np
-from mujoco import rollout
+from mujoco import mjx, rollout
 
 from benchmarks.common import measure
 from palm_jax.envs import ROBOTS, TASKS, make, physics
@@ -20,7 +20,7 @@ from palm_jax.envs.base import Env
 from palm_jax.envs.rollout import repeat_params
 
 SUBSTEPS = 10
-
+_PEER = "mujoco.rollout"
 
 COMPILED = ("lift_spam", "panda")
 """The task and the robot whose compile time is measured."""
@@ -44,12 +44,19 @@ def run(*, worlds: tuple[int, ...] = (64, 128), repeats: int = 10) -> dict[str, 
             robots[robot][task] = _task(make(task, robot), counts, repeats)
             _report(task, robot, robots[robot][task][str(worlds[-1])])
     tasks = robots[COMPILED[1]]
-    best = max(figures["mjx"]["per_second"] for figures in tasks["lift_spam"].values())
+    rows = tasks["lift_spam"].values()
+    best = {name: max(row[name]["per_second"] for row in rows) for name in ("mjx", _PEER)}
+    plain = _plain_mjx(make("lift_spam"))
     return {
-        "steps_per_second": best,
+        "steps_per_second": best["mjx"],
+        "peers": {
+            _PEER: {"steps_per_second": best[_PEER]},
+            "mjx.step, default options": {"steps_per_second": plain["per_second"]},
+        },
+        "plain_mjx": plain,
         "tasks": tasks,
         "robots": {
-            robot: {task: rows[str(worlds[-1])] for task, rows in by_task.items()}
+            robot: {task: row[str(worlds[-1])] for task, row in by_task.items()}
             for robot, by_task in robots.items()
         },
         "compile": compile_seconds(*COMPILED, worlds=worlds[-1]),
@@ -60,7 +67,7 @@ def run(*, worlds: tuple[int, ...] = (64, 128), repeats: int = 10) -> dict[str, 
 
 def _report(task: str, robot: str, figures: dict[str, dict[str, float]]) -> None:
     """A row of the table for people, on stderr: stdout is the JSON."""
-    ours, theirs = (figures[name]["per_second"] for name in ("mjx", "mujoco.rollout"))
+    ours, theirs = (figures[name]["per_second"] for name in ("mjx", _PEER))
     print(
         f"  {task:<22} {robot:<6} MJX {ours:>8.0f} steps/s   C MuJoCo {theirs:>8.0f} steps/s",
         file=sys.stderr,
@@ -100,8 +107,15 @@ def _batch(env: Env, worlds: int, repeats: int) -> dict[str, Any]:
     data = physics.jit_physics(jax.vmap(env.place))(keys, params).data
     step = physics.jit_physics(jax.vmap(lambda d: physics.substeps(env.mjx_model, d, SUBSTEPS)))
     items = worlds * SUBSTEPS
-    mjx = measure(lambda: step(data), repeats=repeats, items=items)
-    return {"mjx": mjx, "mujoco.rollout": _rollout(env, data, repeats, items)}
+    ours = measure(lambda: step(data), repeats=repeats, items=items)
+    return {"mjx": ours, _PEER: _rollout(env, data, repeats, items)}
+
+
+def _plain_mjx(env: Env) -> dict[str, float]:
+    """One world, as the documentation of MJX steps it: without the compiler option."""
+    data = jax.tree.map(lambda x: x[None], mjx.make_data(env.mj_model))
+    step = jax.jit(jax.vmap(mjx.step, in_axes=(None, 0)))
+    return measure(lambda: step(env.mjx_model, data), repeats=3, items=1)
 
 
 def _rollout(env: Env, data: Any, repeats: int, items: int) -> dict[str, float]:

@@ -1,22 +1,27 @@
-"""Speed of behaviour cloning: the training step of the CPU presets, and acting.
+"""Speed of behaviour cloning: the training step, beside PyTorch, and acting.
 
-One step = random camera turn, random perspective, random overlay, crop, forward, backward and
-Adam, from uint8 images in host memory: width 16, 84 px cropped to 76, batch 64.
+One step = random perspective, random overlay, crop, forward, backward and Adam, from uint8 images
+in host memory: 84 px cropped to 76, batch 64, at the CPU presets' width and at the paper's. The
+random camera turn of the CPU presets, which PyTorch's step does not have, is a row of its own.
 """
 
 import time
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from benchmarks.common import measure
+from benchmarks.common import measure, side_by_side
+from benchmarks.peers import train as others
 from palm_jax import align
 from palm_jax.train import learner
 
 SIDE = 84
 PROPRIO_DIM = 8
 SAMPLES = 1024
+BACKGROUNDS = 64
+WIDTHS = (16, 64)
 ACT_BATCHES = (1, 64, 256)
 
 
@@ -34,49 +39,92 @@ def _data() -> learner.Batch:
     )
 
 
-def run(*, steps: int = 20, repeats: int = 10) -> dict[str, Any]:
-    """Measure; `samples_per_second` is the best step's, `act` maps batch sizes to images/s."""
-    config = learner.LearnerConfig(overlay_warmup_steps=0, turn=(0.35, 0.17))
-    made = learner.make_learner(config, PROPRIO_DIM)
-    data, key = _data(), jax.random.key(0)
-    bank = jax.jit(align.procedural_bank, static_argnums=(1, 2))(key, 64, SIDE)
-    state = made.jitted_init(key, learner.fit_normalizer(data.proprio, data.actions))
+class _Trainer(NamedTuple):
+    """Our step, ready to be timed."""
 
-    start = time.perf_counter()
-    state, _ = jax.block_until_ready(
-        made.jitted_step(key, state, learner.take(data, np.arange(64)), bank)
-    )
-    compile_seconds = time.perf_counter() - start
-    done = 1
+    call: Callable[[], None]
+    parameters: int
+    compile_seconds: float
+    act: Callable[[int], Any]
+
+
+def run(*, repeats: int = 20) -> dict[str, Any]:
+    """`samples_per_second` of the best step at width 16, `act` maps batch sizes to images/s."""
+    key, data = jax.random.key(0), _data()
+    bank = jax.jit(align.procedural_bank, static_argnums=(1, 2))(key, BACKGROUNDS, SIDE)
+    steps: dict[str, Any] = {}
+    for width in WIDTHS:
+        config = learner.LearnerConfig(width=width, overlay_warmup_steps=0)
+        ours = _trainer(config, data, bank)
+        theirs = others.peers(_setting(config, data, bank))
+        calls = {"palm_jax": ours.call} | {name: peer.call for name, peer in theirs.items()}
+        row = side_by_side(calls, repeats=repeats, items=config.batch_size)
+        row["palm_jax"]["compile_seconds"] = ours.compile_seconds
+        row["palm_jax"]["parameters"] = ours.parameters
+        for name, peer in theirs.items():
+            row[name]["parameters"] = peer.parameters
+        steps[str(width)] = row
+    config = learner.LearnerConfig(overlay_warmup_steps=0, turn=(0.35, 0.17))
+    turning = _trainer(config, data, bank)
+    first = steps[str(WIDTHS[0])]
+    return {
+        "samples_per_second": first["palm_jax"]["per_second"],
+        "peers": {
+            name: {"samples_per_second": entry["per_second"]}
+            for name, entry in first.items()
+            if name != "palm_jax"
+        },
+        "steps": steps,
+        "with_turn": measure(turning.call, repeats=repeats, items=config.batch_size),
+        "act": {
+            str(count): measure(lambda n=count: turning.act(n), repeats=repeats, items=count)
+            for count in ACT_BATCHES
+        },
+        "pixels": config.crop,
+        "batch_size": config.batch_size,
+        "device": jax.devices()[0].device_kind,
+    }
+
+
+def _trainer(config: learner.LearnerConfig, data: learner.Batch, bank: jax.Array) -> _Trainer:
+    made, key = learner.make_learner(config, PROPRIO_DIM), jax.random.key(0)
+    state = made.jitted_init(key, learner.fit_normalizer(data.proprio, data.actions))
+    done = 0
 
     def step() -> None:
         nonlocal state, done
         indices = learner.batch_indices(key, done, SAMPLES, config.batch_size)
-        state, _ = jax.block_until_ready(
-            made.jitted_step(key, state, learner.take(data, indices), bank)
-        )
+        batch = learner.take(data, indices)
+        state, _ = jax.block_until_ready(made.jitted_step(key, state, batch, bank))
         done += 1
 
-    training = measure(step, repeats=steps, items=config.batch_size)
-    policy = made.policy_state(state)
+    start = time.perf_counter()
+    step()
+    seconds = time.perf_counter() - start
 
-    def act(count: int) -> dict[str, float]:
+    def act(count: int) -> Any:
         images, proprio = {"front": data.images["front"][:count]}, data.proprio[:count]
-        return measure(
-            lambda: made.jitted_act(key, policy, images, proprio),
-            repeats=repeats,
-            items=count,
-        )
+        return made.jitted_act(key, made.policy_state(state), images, proprio)
 
-    return {
-        "samples_per_second": training["per_second"],
-        "samples_per_second_median": training["per_second_median"],
-        "cpu_ms_per_sample": training["cpu_ms_each"],
-        "first_step_seconds": compile_seconds,
-        "act": {str(count): act(count) for count in ACT_BATCHES},
-        "width": config.width,
-        "pixels": config.crop,
-        "batch_size": config.batch_size,
-        "parameters": sum(leaf.size for leaf in jax.tree.leaves(state.params)),
-        "device": jax.devices()[0].device_kind,
-    }
+    parameters = sum(leaf.size for leaf in jax.tree.leaves(state.params))
+    return _Trainer(step, parameters, seconds, act)
+
+
+def _setting(config: learner.LearnerConfig, data: learner.Batch, bank: jax.Array) -> others.Setting:
+    """The same for another package."""
+    normalizer = learner.fit_normalizer(data.proprio, data.actions)
+    return others.Setting(
+        images=data.images["front"],
+        proprio=np.asarray(normalizer.proprio.normalize(data.proprio)),
+        actions=np.asarray(normalizer.action.normalize(data.actions)),
+        bank=np.asarray(bank),
+        width=config.width,
+        crop=config.crop or SIDE,
+        embed=config.embed,
+        hidden=config.hidden,
+        batch_size=config.batch_size,
+        learning_rate=config.learning_rate,
+        grad_clip=config.grad_clip,
+        distortion=config.perspective_distortion,
+        proprio_noise=config.proprio_noise,
+    )

@@ -24,21 +24,35 @@ def measure(call: Callable[[], Any], *, repeats: int, items: int) -> dict[str, f
       per_second of the best and of the median run, CPU milliseconds for each item (less sensitive
       to a busy machine than wall time), seconds of the first run.
     """
-    start = time.perf_counter()
-    jax.block_until_ready(call())
-    first = time.perf_counter() - start
-    seconds, before = [], _cpu_seconds()
+    return side_by_side({"call": call}, repeats=repeats, items=items)["call"]
+
+
+def side_by_side(
+    calls: dict[str, Callable[[], Any]], *, repeats: int, items: int
+) -> dict[str, dict[str, float]]:
+    """`measure` of several calls in turns, so that a busy moment of the machine hits them all."""
+    first = {name: _timed(call)[0] for name, call in calls.items()}
+    runs: dict[str, list[tuple[float, float]]] = {name: [] for name in calls}
     for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(call())
-        seconds.append(time.perf_counter() - start)
-    cpu = _cpu_seconds() - before
-    return {
-        "per_second": items / min(seconds),
-        "per_second_median": items / float(np.median(seconds)),
-        "cpu_ms_each": 1e3 * cpu / repeats / items,
-        "first_call_seconds": first,
-    }
+        for name, call in calls.items():
+            runs[name].append(_timed(call))
+    found = {}
+    for name, pairs in runs.items():
+        seconds, cpu = np.array(pairs).T
+        found[name] = {
+            "per_second": items / float(seconds.min()),
+            "per_second_median": items / float(np.median(seconds)),
+            "cpu_ms_each": 1e3 * float(cpu.mean()) / items,
+            "first_call_seconds": first[name],
+        }
+    return found
+
+
+def _timed(call: Callable[[], Any]) -> tuple[float, float]:
+    """Wall and CPU seconds until the result of `call` is there."""
+    start, before = time.perf_counter(), _cpu_seconds()
+    jax.block_until_ready(call())
+    return time.perf_counter() - start, _cpu_seconds() - before
 
 
 def _cpu_seconds() -> float:

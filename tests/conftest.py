@@ -39,14 +39,23 @@ def pytest_configure(config: pytest.Config) -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_CACHING)
 
 
+_TOGETHER = {
+    "envs": ("test_demos.py",),  # besides all of tests/envs that is not named here
+    "stages": ("test_stages.py", "test_docs.py"),
+    "gym": ("test_gym.py",),  # late, when its worlds have been compiled by the others
+}
+"""Files that share worlds, by a name for their process."""
+
+
 class Processes(LoadScopeScheduling):
     """Which tests share a process: those of a file; and those of files that share worlds, which
     take longer to compile than all else and would be compiled in both processes."""
 
     def _split_scope(self, nodeid: str) -> str:
         file = Path(nodeid.split("::")[0])
-        if file.name in ("test_stages.py", "test_docs.py"):
-            return "stages"
+        for name, files in _TOGETHER.items():
+            if file.name in files:
+                return name
         return "envs" if file.parent.name == "envs" else str(file)
 
 
