@@ -1,8 +1,9 @@
 """Alignment and augmentation: images a second, beside OpenCV, torchvision and kornia.
 
-Two kinds of rows. `operations` do the same to the same images in every package (their pictures are
-compared first: `difference`). `ours` are the operations of the hot paths that draw their randomness
-themselves, and the batch of windows that a renderer has already cut.
+Two kinds of rows. `operations` do the same to the same images in every package (`difference`: the
+mean distance of their pictures from ours, as a share of the whole range). `ours` are the operations
+of the hot paths that draw their randomness themselves, and the batch of windows that a renderer has
+already cut.
 """
 
 from collections.abc import Callable
@@ -12,27 +13,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.common import measure, side_by_side
+from benchmarks.common import headline, measure, side_by_side
 from benchmarks.peers import align as others
 from palm_jax import align
 
 BATCHES = (64, 512)
 SIDE, FRAME = 84, 512
 SPEC = align.AlignSpec(size=SIDE)
-HEADLINE = "align"
 
 
 def run(*, repeats: int = 20) -> dict[str, Any]:
     """`images_per_second` of the whole `align` of 512-pixel frames in batches of 64."""
     tables = {str(batch): _same_work(batch, repeats) for batch in BATCHES}
-    rates = tables[str(BATCHES[0])][HEADLINE]
     return {
-        "images_per_second": rates["palm_jax"]["per_second"],
-        "peers": {
-            name: {"images_per_second": entry["per_second"]}
-            for name, entry in rates.items()
-            if name != "palm_jax"
-        },
+        **headline(tables[str(BATCHES[0])]["align"], "images_per_second"),
         "operations": tables,
         "ours": _ours(repeats),
         "pixels": SIDE,
@@ -70,13 +64,13 @@ def inputs(batch: int) -> others.Inputs:
     points, _ = jax.vmap(jax.vmap(lambda point: align.project(camera, point)))(jnp.asarray(tips))
     crop = SPEC.crop or FRAME
     corner = np.floor(np.asarray(points[:, 0]) + np.array(SPEC.offset) - crop // 2).astype(int)
-    outer = np.array([[0, 0], [SIDE, 0], [SIDE, SIDE], [0, SIDE]], np.float32)
     inwards = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]], np.float32)
     return others.Inputs(
         frames=frames,
         small=small,
         backgrounds=small[::-1].copy(),
-        corners=outer + inwards * rng.integers(0, 9, (batch, 4, 2)).astype(np.float32),
+        corners=others.outer_corners(SIDE)
+        + inwards * rng.integers(0, 9, (batch, 4, 2)).astype(np.float32),
         points=np.asarray(points),
         rotation=np.asarray(tcps)[:, :3, :3],
         height=np.asarray(tcps)[:, 2, 3],
@@ -109,8 +103,8 @@ def _same_work(batch: int, repeats: int) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name in calls["palm_jax"]:
         able = {package: table[name] for package, table in calls.items() if name in table}
-        pictures = {package: _pictures(call()) for package, call in able.items()}
         found[name] = side_by_side(able, repeats=repeats, items=batch)
+        pictures = {package: _pictures(call()) for package, call in able.items()}
         for package, picture in pictures.items():
             found[name][package]["difference"] = _difference(picture, pictures["palm_jax"])
     return found

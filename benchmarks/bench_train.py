@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from benchmarks.common import measure, side_by_side
+from benchmarks.common import headline, measure, side_by_side
 from benchmarks.peers import train as others
 from palm_jax import align
 from palm_jax.train import learner
@@ -66,14 +66,8 @@ def run(*, repeats: int = 20) -> dict[str, Any]:
         steps[str(width)] = row
     config = learner.LearnerConfig(overlay_warmup_steps=0, turn=(0.35, 0.17))
     turning = _trainer(config, data, bank)
-    first = steps[str(WIDTHS[0])]
     return {
-        "samples_per_second": first["palm_jax"]["per_second"],
-        "peers": {
-            name: {"samples_per_second": entry["per_second"]}
-            for name, entry in first.items()
-            if name != "palm_jax"
-        },
+        **headline(steps[str(WIDTHS[0])], "samples_per_second"),
         "steps": steps,
         "with_turn": measure(turning.call, repeats=repeats, items=config.batch_size),
         "act": {

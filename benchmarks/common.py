@@ -48,6 +48,13 @@ def side_by_side(
     return found
 
 
+def headline(row: dict[str, dict[str, float]], unit: str) -> dict[str, Any]:
+    """`unit` (such as "images_per_second") of ours, and under `peers` that of every other package,
+    of a row as `side_by_side` gives it."""
+    rates = {name: {unit: figures["per_second"]} for name, figures in row.items()}
+    return {**rates.pop("palm_jax"), "peers": rates}
+
+
 def _timed(call: Callable[[], Any]) -> tuple[float, float]:
     """Wall and CPU seconds until the result of `call` is there."""
     start, before = time.perf_counter(), _cpu_seconds()

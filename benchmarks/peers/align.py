@@ -35,9 +35,13 @@ class Inputs(NamedTuple):
 
     @property
     def outer(self) -> np.ndarray:
-        """[4, 2] corners of `small`."""
-        height, width = self.small.shape[1:3]
-        return np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+        """[4, 2] corners (u, v) of `small`."""
+        return outer_corners(self.small.shape[1])
+
+
+def outer_corners(side: int) -> np.ndarray:
+    """[4, 2] corners (u, v) of a square image, clockwise from the top left."""
+    return np.array([[0, 0], [side, 0], [side, side], [0, side]], np.float32)
 
 
 def peers(inputs: Inputs) -> dict[str, dict[str, Operation]]:
@@ -49,7 +53,7 @@ def peers(inputs: Inputs) -> dict[str, dict[str, Operation]]:
         ("torchvision", ("torch", "torchvision.transforms.v2.functional"), _torchvision),
         ("kornia", ("torch", "kornia"), _kornia),
     ):
-        ready = imported(*modules)
+        ready = imported(name, *modules)
         if ready is not None:
             found[name] = build(*ready, inputs)
     return found
@@ -137,10 +141,9 @@ def _torch_windows(torch: Any, inputs: Inputs) -> Operation:
 
 def _torchvision(torch: Any, functional: Any, inputs: Inputs) -> dict[str, Operation]:
     small, backgrounds = (_channels_first(torch, x) for x in (inputs.small, inputs.backgrounds))
-    last = inputs.outer - 1.0
-    last[last < 0] = 0.0  # torchvision names the corners' pixel centres
-    ends = np.round(inputs.corners - np.where(inputs.outer > 0, 1.0, 0.0)).astype(int).tolist()
-    starts = last.astype(int).tolist()
+    inwards = np.where(inputs.outer > 0, 1, 0)  # torchvision names the corners' pixel centres
+    starts = (inputs.outer - inwards).astype(int).tolist()
+    ends = np.round(inputs.corners - inwards).astype(int).tolist()
 
     def warped() -> Any:
         return torch.stack(

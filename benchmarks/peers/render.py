@@ -6,6 +6,7 @@ pixels; `segmentation` says what it saw, which is compared before the speed is.
 
 import copy
 import functools
+import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -41,7 +42,7 @@ class Renderer(NamedTuple):
 def peers(job: Job) -> dict[str, Renderer]:
     """By name; what is not installed, or has no OpenGL here, is left out."""
     found = {}
-    warp = imported("warp")
+    warp = imported("Warp", "warp")
     if warp:
         warp[0].config.quiet = True  # it tells of every kernel that it compiles
     for name, modules, build in (
@@ -50,7 +51,7 @@ def peers(job: Job) -> dict[str, Renderer]:
         ("mujoco_warp", ("warp", "mujoco_warp"), _mujoco_warp),
         ("mjx.render", ("warp", "mujoco.mjx"), _mjx_warp),
     ):
-        ready = imported(*modules)
+        ready = imported(name, *modules)
         made = None if ready is None else build(*ready, job)
         if made is not None:
             found[name] = made
@@ -72,7 +73,8 @@ def _opengl(job: Job, *, plain: bool) -> Renderer | None:
         model.vis.quality.offsamples, model.vis.quality.shadowsize = 4, 4096
     try:
         renderer = mujoco.Renderer(model, job.side, job.side)
-    except Exception:  # EGL says it in many ways
+    except Exception as error:  # EGL says it in many ways
+        print(f"  without mujoco.Renderer: {error}", file=sys.stderr)
         return None
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = job.shadows
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False

@@ -38,7 +38,7 @@ class Step(NamedTuple):
 
 def peers(setting: Setting) -> dict[str, Step]:
     """By package: PyTorch, if it is installed."""
-    ready = imported("torch")
+    ready = imported("pytorch", "torch")
     return {} if ready is None else {"pytorch": _pytorch(*ready, setting)}
 
 
