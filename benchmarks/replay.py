@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from palm_jax.envs import physics
+from palm_jax.envs import physics, tree
 from palm_jax.envs.base import Env, EnvParams, State
 from palm_jax.envs.rollout import Runner
 
@@ -83,8 +83,8 @@ def _judged(env: Env, state: State, ctrl: jax.Array, last: _Joints, now: _Joints
     """`Env.judge` of what C MuJoCo gave. Like MJX's, contacts are those that the last substep
     started with, poses agree with the final joints."""
     data = state.data.replace(qpos=last.qpos, qvel=last.qvel, ctrl=ctrl)
-    data = mjx.collision(env.mjx_model, mjx.kinematics(env.mjx_model, data))
-    data = mjx.kinematics(env.mjx_model, data.replace(qpos=now.qpos, qvel=now.qvel))
+    data = mjx.collision(env.mjx_model, tree.kinematics(env.mjx_model, data))
+    data = tree.kinematics(env.mjx_model, data.replace(qpos=now.qpos, qvel=now.qvel))
     return env.judge(state, data)
 
 

@@ -27,7 +27,7 @@ from palm_jax.align import (
     unproject_to_height,
     window_origin,
 )
-from palm_jax.envs import control, physics
+from palm_jax.envs import control, physics, tree
 from palm_jax.envs.calibration import miscalibrated
 from palm_jax.envs.distractors import Distractors
 from palm_jax.envs.params import TEST_HIGH, TEST_LOW
@@ -214,7 +214,7 @@ class Env:
             mocap_pos=jnp.concatenate([parked.pos, placement.mocap_pos]),
             mocap_quat=jnp.concatenate([parked.quat, placement.mocap_quat]),
         )
-        data = mjx.kinematics(self.mjx_model, data)
+        data = tree.kinematics(self.mjx_model, data)
         arranged = self._distractors.arrange(
             jax.random.fold_in(key, _DISTRACTOR_DRAW), params, data, xy
         )
@@ -222,7 +222,7 @@ class Env:
             mocap_pos=data.mocap_pos.at[: len(arranged.pos)].set(arranged.pos),
             mocap_quat=data.mocap_quat.at[: len(arranged.quat)].set(arranged.quat),
         )
-        data = mjx.kinematics(self.mjx_model, data)
+        data = tree.kinematics(self.mjx_model, data)
         pose = _at_distance(params.camera_to_world, radius)
         camera = Camera.from_fovy(params.camera_fovy, PAPER_FRAME, PAPER_FRAME, pose)
         turned = camera.rotated_about(jnp.asarray(WORKSPACE_CENTRE), angle)
@@ -264,7 +264,7 @@ class Env:
         data = state.data.replace(qpos=qpos, mocap_pos=mocap_pos, mocap_quat=mocap_quat)
         return dataclasses.replace(
             state,
-            data=mjx.kinematics(self.mjx_model, data),
+            data=tree.kinematics(self.mjx_model, data),
             camera_to_world=camera_to_world,
         )
 
@@ -309,7 +309,7 @@ class Env:
             qpos=state.data.qpos.at[self._arm_qpos].set(arm),
             ctrl=self._servo_targets(arm, jnp.ones(())),
         )
-        data = mjx.kinematics(self.mjx_model, data)
+        data = tree.kinematics(self.mjx_model, data)
         return dataclasses.replace(state, data=data, draws=draws, reachable=reachable)
 
     def jump(self, state: State, params: EnvParams) -> State:
@@ -346,7 +346,7 @@ class Env:
             qacc_warmstart=jnp.where(moves, 0.0, data.qacc_warmstart),
             ctrl=jnp.where(moves, jnp.where(opens, opened, kept), data.ctrl),
         )
-        data = mjx.kinematics(self.mjx_model, data)
+        data = tree.kinematics(self.mjx_model, data)
         return dataclasses.replace(
             state, data=data, draws=state.draws + draws, jump=jnp.zeros((), bool)
         )

@@ -73,16 +73,16 @@ class Distractors:
         taken_radius = jnp.asarray(self._obstacle_radius)
         parked = self.parked()
         pos, quat = [], []
-        for index, radius in enumerate(self._radius):
-            xy_key, yaw_key = jax.random.split(jax.random.fold_in(key, index))
-            candidates = jax.random.uniform(
-                xy_key, (_CANDIDATES, 2), minval=params.area_low, maxval=params.area_high
-            )
+        drawn, yaws = jax.vmap(lambda index: _draw(jax.random.fold_in(key, index), params))(
+            jnp.arange(len(self.bodies))
+        )
+        for index, (radius, candidates, yaw) in enumerate(
+            zip(self._radius, drawn, yaws, strict=True)
+        ):
             away = jnp.linalg.norm(candidates[:, None] - taken, axis=-1) - taken_radius - radius
             apart = jnp.linalg.norm(candidates - target, axis=-1) - TARGET_DISTANCE
             clear = jnp.minimum(away.min(-1) - _GAP, apart)
             xy = candidates[jnp.argmax(jnp.minimum(clear, 0.0))]
-            yaw = jax.random.uniform(yaw_key, (), minval=-jnp.pi, maxval=jnp.pi)
             shown = index < params.distractors
             at = jnp.append(xy, TABLE_HEIGHT)
             turn = yaw_quaternion(yaw)
@@ -91,6 +91,15 @@ class Distractors:
             taken = jnp.concatenate([taken, xy[None]])
             taken_radius = jnp.append(taken_radius, radius)
         return MocapPoses(jnp.stack(pos), jnp.stack(quat))
+
+
+def _draw(key: jax.Array, params: EnvParams) -> tuple[jax.Array, jax.Array]:
+    """Candidates [C, 2] for a distractor's xy, and its yaw."""
+    xy_key, yaw_key = jax.random.split(key)
+    candidates = jax.random.uniform(
+        xy_key, (_CANDIDATES, 2), minval=params.area_low, maxval=params.area_high
+    )
+    return candidates, jax.random.uniform(yaw_key, (), minval=-jnp.pi, maxval=jnp.pi)
 
 
 def task_geoms(model: mujoco.MjModel) -> np.ndarray:

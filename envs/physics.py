@@ -19,6 +19,8 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
+from palm_jax.envs import constraints, solver, tree
+
 MAX_CPU_WORLDS = 128
 """Larger batches are no faster on CPUs and take more memory: run them in chunks of at most this."""
 
@@ -49,27 +51,46 @@ def _after_the_solver(data: mjx.Data) -> mjx.Data:
 
 
 _STAGES: tuple[Callable[[mjx.Model, mjx.Data], mjx.Data], ...] = (
-    mjx.kinematics,
-    mjx.com_pos,
+    tree.kinematics,
+    tree.com_pos,
     mjx.crb,
     mjx.factor_m,
     mjx.collision,
-    mjx.make_constraint,
+    constraints.make_constraint,
     mjx.transmission,
-    mjx.fwd_velocity,
+    tree.velocities,
     mjx.fwd_actuation,
-    mjx.fwd_acceleration,
-    mjx.solve,
+    tree.accelerations,
+    solver.solve,
     lambda _, data: _after_the_solver(data),
     mjx.implicit,
 )
 
 
+def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.forward` for such a model: everything that follows from the state, up to `qacc`."""
+    for stage in _STAGES[:-2]:
+        data = stage(model, data)
+    return data
+
+
 def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """One physics step: `mjx.step` for a model without tendons, sensors or moving cameras."""
     for stage in _STAGES:
-        data = jax.lax.optimization_barrier(stage(model, data))
+        data = _barrier(data, stage(model, data))
     return data
+
+
+def _barrier(before: mjx.Data, after: mjx.Data) -> mjx.Data:
+    """`after`, with a barrier round what a stage has changed: of a hundred arrays a few, and
+    tracing counts them all."""
+    old, structure = jax.tree.flatten(before)
+    new = jax.tree.leaves(after)
+    changed = [index for index, (a, b) in enumerate(zip(old, new, strict=True)) if a is not b]
+    held = jax.lax.optimization_barrier([new[index] for index in changed])
+    for index, value in zip(changed, held, strict=True):
+        new[index] = value
+    return jax.tree.unflatten(structure, new)
 
 
 def substeps(model: mjx.Model, data: mjx.Data, count: int) -> mjx.Data:
@@ -79,7 +100,7 @@ def substeps(model: mjx.Model, data: mjx.Data, count: int) -> mjx.Data:
     rendered and observed agree with the stored state.
     """
     data, _ = jax.lax.scan(lambda d, _: (step(model, d), None), data, None, length=count)
-    return mjx.kinematics(model, data)
+    return tree.kinematics(model, data)
 
 
 def in_contact(data: mjx.Data, first: int, second: int) -> jax.Array:
