@@ -132,7 +132,7 @@ class Runner:
         self._jump = physics.jit_physics(jax.vmap(_jump_if_asked(env)))
         self.expert = physics.jit_physics(jax.vmap(env.expert))
         self._place = physics.jit_physics(jax.vmap(env.place))
-        self._locate = jax.jit(jax.vmap(env.locate))
+        self._locate = jax.jit(physics.traced_quickly(jax.vmap(env.locate)))
         self.restore = physics.jit_physics(jax.vmap(env.restore))
         self._reposition = physics.jit_physics(jax.vmap(env.reposition))
         self._views: dict[Hashable, Callable[..., Any]] = {}
