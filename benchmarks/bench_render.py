@@ -82,10 +82,11 @@ def _axes(z: tuple[float, float, float]) -> np.ndarray:
     return np.stack([np.cross(second, third), second, third], 1)
 
 
-def arm_over_table() -> Scene:
-    """35 primitives of all six types, wood and checker, two directional lights."""
-    parts = (*_FURNITURE, *_ARM, *_OBJECTS)
-    textures = ["checker", "wood"] + ["none"] * (len(parts) - 2)
+def arm_over_table(parts: int | None = None, *, copies: int = 1) -> Scene:
+    """35 primitives of all six types (or the first `parts`; or all but the furniture `copies`
+    times), wood and checker, two directional lights."""
+    chosen = (*_FURNITURE, *((*_ARM, *_OBJECTS) * copies))[:parts]
+    textures = ["checker", "wood"] + ["none"] * (len(chosen) - 2)
     lights = make_lights(
         dir=[[0.4, 0.35, -1.0], [-0.6, -0.3, -0.5]],
         diffuse=[[0.65] * 3, [0.25] * 3],
@@ -93,11 +94,11 @@ def arm_over_table() -> Scene:
         ambient=0.35,
     )
     return make_scene(
-        [part.kind for part in parts],
-        np.array([part.pos for part in parts]),
-        np.stack([_axes(part.axis) for part in parts]),
-        np.array([(*part.size, 0.0, 0.0)[:3] for part in parts]),
-        np.array([part.rgb for part in parts]),
+        [part.kind for part in chosen],
+        np.array([part.pos for part in chosen]),
+        np.stack([_axes(part.axis) for part in chosen]),
+        np.array([(*part.size, 0.0, 0.0)[:3] for part in chosen]),
+        np.array([part.rgb for part in chosen]),
         textures=textures,
         texture_scale=np.array([0.5 if kind == "checker" else 0.1 for kind in textures]),
         lights=lights,
@@ -168,4 +169,32 @@ def run(
         memory = compiled.memory_analysis()
         if memory is not None:
             found[name]["temporary_mib"] = memory.temp_size_in_bytes / 2**20
-    return {"frames_per_second": found["rgb"]["per_second"], **found}
+    found["scaling"] = scaling(repeats=repeats)
+    return {"frames_per_second": found["rgb"]["per_second_median"], **found}
+
+
+def scaling(*, repeats: int = 10) -> dict[str, dict[str, float]]:
+    """Median seconds of a batch by worlds (84 px), by pixels of a frame (16 worlds) and by
+    primitives (16 worlds, 84 px): the furniture, half of the scene, all of it, most of it twice."""
+    scene, view = arm_over_table(), view_of_table()
+
+    def seconds(scenes: Scene, side: int) -> float:
+        worlds = len(scenes.pos)
+        camera = view.scaled(side / view.height)
+        draw = jax.jit(jax.vmap(lambda scene: render(scene, camera).rgb))
+        return (
+            worlds
+            / measure(lambda: draw(scenes), repeats=repeats, items=worlds)["per_second_median"]
+        )
+
+    sides, count = (32, 64, 128, 256), len(scene.types)
+    twice = arm_over_table(copies=2)
+    parts = {n: arm_over_table(parts=n) for n in (len(_FURNITURE), count // 2, count)}
+    return {
+        "worlds": {str(n): seconds(scattered(scene, n), SIDE) for n in (1, 4, 16, 64, 256)},
+        "pixels": {str(side**2): seconds(scattered(scene, 16), side) for side in sides},
+        "primitives": {
+            str(len(each.types)): seconds(scattered(each, 16), SIDE)
+            for each in (*parts.values(), twice)
+        },
+    }

@@ -50,8 +50,8 @@ def side_by_side(
 
 def headline(row: dict[str, dict[str, float]], unit: str) -> dict[str, Any]:
     """`unit` (such as "images_per_second") of ours, and under `peers` that of every other package,
-    of a row as `side_by_side` gives it."""
-    rates = {name: {unit: figures["per_second"]} for name, figures in row.items()}
+    of a row as `side_by_side` gives it: medians."""
+    rates = {name: {unit: figures["per_second_median"]} for name, figures in row.items()}
     return {**rates.pop("palm_jax"), "peers": rates}
 
 

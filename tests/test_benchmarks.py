@@ -1,13 +1,15 @@
 """The bookkeeping of benchmarks; what they measure is not a matter of tests."""
 
+import json
 import sys
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import benchmarks.__main__ as bench
-from benchmarks import bench_lift_spam, common
+from benchmarks import bench_lift_spam, common, page
 
 
 def test_calls_are_timed_in_turns():
@@ -51,3 +53,52 @@ def test_edges_are_where_a_neighbour_differs():
     ids[0, 2, 4] = 3
     inside = bench_lift_spam._away_from_edges(ids)[0]
     assert not inside[1:4, 3:].any() and inside[1:4, 1:3].all()
+
+
+RESULT = {
+    "machine": "a machine, 2 cores",
+    "load": [0.25, 0.0, 0.0],
+    "date": "2026-01-01",
+    "versions": {"jax": "1.2"},
+    "details": {
+        "align": {
+            "bench_align": {
+                "operations": {
+                    "64": {
+                        "align": {
+                            "palm_jax": {"per_second_median": 12345.6},
+                            "opencv": {"per_second_median": 98.76},
+                        },
+                        "overlay": {"palm_jax": {"per_second_median": 7.0}},
+                    }
+                },
+                "ours": {"random_crop": {"per_second_median": 3.0}},
+            }
+        }
+    },
+}
+
+
+def test_a_page_gets_the_figures_between_its_markers(tmp_path: Path):
+    source, target = tmp_path / "result.json", tmp_path / "page.md"
+    source.write_text(json.dumps(RESULT))
+    target.write_text(f"before\n{page.BEGIN}\nold\n{page.END}\nafter\n")
+    assert page.main([str(source), str(target)]) == 0
+    written = target.read_text()
+    assert written.startswith("before\n") and written.endswith("\nafter\n")
+    assert "old" not in written
+    assert "| batch of 64 | palm_jax | opencv |" in written
+    assert "| align | 12 346 | 98.8 |" in written
+    assert "| overlay | 7.0 | - |" in written
+    # Once more changes nothing.
+    assert page.main([str(source), str(target)]) == 0
+    assert target.read_text() == written
+
+
+def test_a_page_without_markers_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    source, target = tmp_path / "result.json", tmp_path / "page.md"
+    source.write_text(json.dumps(RESULT))
+    target.write_text("text")
+    assert page.main([str(source), str(target)]) == 1
+    assert "page.md: expected the markers" in capsys.readouterr().err
+    assert target.read_text() == "text"

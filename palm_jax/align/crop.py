@@ -23,6 +23,7 @@ from palm_jax._checks import (
     check_fits,
     is_concrete,
 )
+from palm_jax.align import pixels
 
 BORDERS = ("shift", "edge", "constant")
 # The row or column of a window pixel that shows no pixel of the image: far from every stroke.
@@ -59,11 +60,11 @@ def cut_window(
     origin = clamp_origin(wanted, size, height, width)
     start = (origin[0], origin[1], jnp.int32(0))
     window = lax.dynamic_slice(image, start, (size, size, depth))
-    pixels = jnp.arange(size, dtype=jnp.int32)
+    steps = jnp.arange(size, dtype=jnp.int32)
     if border == "shift":
-        return window, origin[0] + pixels, origin[1] + pixels
+        return window, origin[0] + steps, origin[1] + steps
     # What lies inside the image lies inside the clamped window, too.
-    source = pixels + wanted[:, None]
+    source = steps + wanted[:, None]
     limit = jnp.asarray([[height - 1], [width - 1]], jnp.int32)
     near = jnp.clip(source, 0, limit)
     moved = window[near[0] - origin[0]][:, near[1] - origin[1]]
@@ -173,6 +174,8 @@ def resize_any(image: jax.Array, rows: int, columns: int) -> jax.Array:
     """`resize` without its checks."""
     if image.shape[:2] == (rows, columns):
         return image
+    if image.dtype == jnp.uint8 and image.shape[-1] == 3:
+        return resize_words(pixels.pack(image), rows, columns)
     top, bottom, down = _taps(image.shape[0], rows)
     left, right, across = _taps(image.shape[1], columns)
     # Rows first: they are contiguous copies, and only these few reach the column gather.
@@ -181,3 +184,21 @@ def resize_any(image: jax.Array, rows: int, columns: int) -> jax.Array:
     start = bands[:, left]
     mixed = start + across[:, None] * (bands[:, right] - start)
     return mixed.astype(image.dtype)
+
+
+def resize_words(words: jax.Array, rows: int, columns: int) -> jax.Array:
+    """`resize` of packed pixels [H, W] to uint8 [rows, columns, 3]: a gather fetches a pixel."""
+    top, bottom, down = _taps(words.shape[0], rows)
+    left, right, across = _taps(words.shape[1], columns)
+    # Rows, then columns, each corner for itself: with one gather for all, XLA computes what the
+    # words come from (such as an overlay) anew for every corner.
+    corners = [words[row][:, column] for column in (left, right) for row in (top, bottom)]
+    planes = []
+    for index in range(3):
+        over_left, under_left, over_right, under_right = (
+            pixels.channel(corner, index) for corner in corners
+        )
+        start = over_left + down[:, None] * (under_left - over_left)
+        end = over_right + down[:, None] * (under_right - over_right)
+        planes.append(start + across * (end - start))
+    return pixels.unpack(planes, half=0.0)

@@ -10,7 +10,7 @@ covered. Two ways to draw share this:
   pixel: end points are exact and coverage is a fraction, as the reference's strokes look after its
   resize.
 
-About 80 operations a pixel and no branches.
+About 80 operations a pixel for the smooth one, 20 for the sharp one, and no branches.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 from palm_jax._checks import (
@@ -37,6 +38,7 @@ from palm_jax.align import pixels
 REACH = 0.47
 # Pixels exactly on an edge belong to the polygon; this is for the rounding of float32.
 ON_EDGE = 0.01
+_COLOURS = (0x0000FF, 0x00FF00, 0xFF0000, 0xFFFFFF)  # packed words: x, y, z, dot
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,48 +168,78 @@ def _smooth_arrow(tip: jax.Array, strokes: Strokes) -> jax.Array:
     )
 
 
+def _planes(points: Points, strokes: Strokes, *, sharp: bool) -> jax.Array:
+    """[3, 7, 3] half-planes of the x, y, z arrows in pixels from the origin: four of the shaft,
+    three of the head. Nothing is inside of an arrow that is not drawn, or that has no length."""
+    arrow = _sharp_arrow if sharp else _smooth_arrow
+    tips = points.uv[1:] - points.uv[0]
+    planes = jax.vmap(lambda tip: arrow(tip, strokes))(tips)
+    drawn = points.drawn[1:] & (jnp.abs(tips).max(-1) > 1e-6)
+    return jnp.where(drawn[:, None, None], planes, jnp.asarray([0.0, 0.0, -1e3]))
+
+
 def coverage(
-    points: Points, strokes: Strokes, rows: jax.Array, columns: jax.Array, *, sharp: bool
+    points: Points, strokes: Strokes, rows: jax.Array, columns: jax.Array
 ) -> list[jax.Array]:
-    """Four [H, W] coverages in [0, 1], for the x, y, z arrows and the dot.
+    """Four [H, W] coverages in [0, 1], for the x, y, z arrows and the dot: smooth.
 
     Args:
-      points: on whole pixels if sharp.
-      strokes: sizes, in pixels of the same frame; Python numbers unless sharp.
+      points: in pixels.
+      strokes: sizes, in pixels of the same frame; Python numbers.
       rows, columns: int [H], [W] pixel numbers, in the frame of the points.
-      sharp: 0 or 1 as in PIL; else the covered part of each pixel.
     """
     # The reference names a pixel by its corner, and so draws half a pixel up-left of its centre.
-    centre = 0.0 if sharp else 0.5
-    origin, tips = points.uv[0], points.uv[1:] - points.uv[0]
-    x = (columns.astype(jnp.float32) + (centre - origin[0]))[None, :]
-    y = (rows.astype(jnp.float32) + (centre - origin[1]))[:, None]
-    arrow = _sharp_arrow if sharp else _smooth_arrow
-    planes = jax.vmap(lambda tip: arrow(tip, strokes))(tips)
-    # Nothing is inside of an arrow that is not drawn, or that has no length.
-    drawn = points.drawn[1:] & (jnp.abs(tips).max(-1) > 1e-6)
-    planes = jnp.where(drawn[:, None, None], planes, jnp.asarray([0.0, 0.0, -1e3]))
+    x = (columns.astype(jnp.float32) + (0.5 - points.uv[0, 0]))[None, :]
+    y = (rows.astype(jnp.float32) + (0.5 - points.uv[0, 1]))[:, None]
+    planes = _planes(points, strokes, sharp=False)
     depths = []
     for axis in range(3):
         distance = [nx * x + (ny * y + inside) for nx, ny, inside in planes[axis]]
         shaft = jnp.minimum(jnp.minimum(*distance[:2]), jnp.minimum(*distance[2:4]))
         head = jnp.minimum(jnp.minimum(*distance[4:6]), distance[6])
         depths.append(jnp.maximum(shaft, head))
-    depths.append(jnp.where(points.drawn[0], _dot_depth(x * x + y * y, strokes, sharp), -1e3))
-    if sharp:
-        return [(depth >= 0).astype(jnp.float32) for depth in depths]
+    # (r^2 - d^2) / 2r equals r - d at the rim, where it matters, and needs no square root.
+    radius = jnp.maximum(jnp.asarray(strokes.dot_radius, jnp.float32), 1e-6)
+    dot = (radius * radius - (x * x + y * y)) / (2 * radius)
+    depths.append(jnp.where(points.drawn[0], dot, -1e3))
     return [jnp.clip(depth + 0.5, 0.0, 1.0) for depth in depths]
 
 
-def _dot_depth(square: jax.Array, strokes: Strokes, sharp: bool) -> jax.Array:
-    """Positive within the dot; about the distance to its rim, in pixels."""
+def masks(points: Points, strokes: Strokes, rows: jax.Array, columns: jax.Array) -> list[jax.Array]:
+    """Four bool [H, W], the pixels of the x, y, z arrows and the dot as PIL draws them: sharp.
+
+    Args:
+      points: on whole pixels.
+      strokes, rows, columns: see `coverage`.
+    """
+    x = columns.astype(jnp.float32) - points.uv[0, 0]
+    y = rows.astype(jnp.float32) - points.uv[0, 1]
+    # A row cuts a convex shape in one run of pixels: two comparisons a pixel instead of the
+    # distances to all its sides. The barrier keeps the divisions with the rows.
+    low, high = jax.lax.optimization_barrier(_runs(_planes(points, strokes, sharp=True), y))
+    inside = (x >= low[..., None]) & (x <= high[..., None])
+    # PIL's disc in a box of +-r pixels holds the centres within about r + 3/8.
     radius = jnp.asarray(strokes.dot_radius, jnp.float32)
-    if sharp:
-        # PIL's disc in a box of +-r pixels holds the centres within about r + 3/8.
-        return radius * (radius + 0.75) - square
-    # (r^2 - d^2) / 2r equals r - d at the rim, where it matters, and needs no square root.
-    radius = jnp.maximum(radius, 1e-6)
-    return (radius * radius - square) / (2 * radius)
+    reach = jnp.where(points.drawn[0], radius * (radius + 0.75), -1.0)
+    dot = (x * x)[None, :] + (y * y)[:, None] <= reach
+    return [*(inside[axis, 0] | inside[axis, 1] for axis in range(3)), dot]
+
+
+def _runs(planes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """First and last x [3, 2, H] of each arrow's shaft and head in the rows at `y` [H]; the first
+    beyond the last where there is none."""
+    slope = planes[..., 0, None]
+    offset = planes[..., 1, None] * y + planes[..., 2, None]
+    level = jnp.abs(slope) < 1e-9  # a side along the row: all of it or nothing
+    bound = -offset / jnp.where(level, 1.0, slope)
+    nowhere = jnp.where(offset >= 0.0, -jnp.inf, jnp.inf)
+    low = jnp.where(level, nowhere, jnp.where(slope > 0.0, bound, -jnp.inf))
+    high = jnp.where(~level & (slope < 0.0), bound, jnp.inf)
+    parts = (slice(0, 4), slice(4, 7))
+    return (
+        jnp.stack([low[:, part].max(1) for part in parts], 1),
+        jnp.stack([high[:, part].min(1) for part in parts], 1),
+    )
 
 
 def paint(image: jax.Array, covered: list[jax.Array]) -> jax.Array:
@@ -224,6 +256,18 @@ def paint(image: jax.Array, covered: list[jax.Array]) -> jax.Array:
     return pixels.unpack([pixels.channel(packed, i) * keep + 255 * added[i] for i in range(3)])
 
 
+def stamp(image: jax.Array, drawn: list[jax.Array]) -> jax.Array:
+    """Red, green, blue, white in that order over the pixels of the masks [H, W] of an image: packed
+    words [H, W], or float [H, W, 3]."""
+    for mask, colour in zip(drawn, _COLOURS, strict=True):
+        if image.dtype == jnp.uint32:
+            image = jnp.where(mask, jnp.uint32(colour), image)
+        else:
+            value = np.array([(colour >> shift) & 1 for shift in (0, 8, 16)], image.dtype)
+            image = jnp.where(mask[..., None], value, image)
+    return image
+
+
 @jax.jit
 def _tcp_overlay(
     image: jax.Array, camera: cam.Camera, tcp: jax.Array, strokes: dict[str, ArrayLike]
@@ -231,7 +275,10 @@ def _tcp_overlay(
     style = Strokes(**strokes)  # type: ignore[arg-type]
     points = to_pixels(overlay_points(camera, tcp, style.axis_length))
     rows, columns = jnp.arange(camera.height), jnp.arange(camera.width)
-    return paint(image, coverage(points, style, rows, columns, sharp=True))
+    drawn = masks(points, style, rows, columns)
+    if image.dtype != jnp.uint8:
+        return stamp(image, drawn)
+    return pixels.unpack_words(stamp(pixels.pack(image), drawn))
 
 
 def tcp_overlay(

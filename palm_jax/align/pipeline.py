@@ -30,6 +30,7 @@ from palm_jax._checks import (
 from palm_jax.align import camera as cam
 from palm_jax.align import crop as cropping
 from palm_jax.align import overlay as drawing
+from palm_jax.align import pixels
 from palm_jax.align.proprio import LAYOUTS, _proprio
 
 
@@ -173,10 +174,20 @@ def _align(
     if spec.overlay:
         points = drawing.overlay_points(camera, tcp, spec.axis_length)
         points = drawing.to_pixels(_jittered(points, overlay_jitter))
-        covered = drawing.coverage(points, spec.strokes, rows, columns, sharp=True)
-        image = drawing.paint(image, covered)
-    image = cropping.resize_any(image, spec.size, spec.size)
+        image = _stamped(image, drawing.masks(points, spec.strokes, rows, columns), spec.size)
+    else:
+        image = cropping.resize_any(image, spec.size, spec.size)
     return Aligned(image, _proprio(tcp, opening, camera, spec.layout), valid)
+
+
+def _stamped(image: jax.Array, drawn: list[jax.Array], size: int) -> jax.Array:
+    """The image [H, W, 3] with the masks' colours on it, resized to `size` pixels a side."""
+    if image.dtype != jnp.uint8:
+        return cropping.resize_any(drawing.stamp(image, drawn), size, size)
+    words = drawing.stamp(pixels.pack(image), drawn)
+    if words.shape == (size, size):
+        return pixels.unpack_words(words)
+    return cropping.resize_words(words, size, size)
 
 
 def align(
@@ -332,6 +343,6 @@ def _align_window(
         points = _jittered(points, None if jitter is None else spec.scale * jnp.asarray(jitter))
         strokes = spec.strokes.scaled(spec.scale)
         rows, columns = origin[:, None] + jnp.arange(spec.size, dtype=jnp.int32)
-        covered = drawing.coverage(points, strokes, rows, columns, sharp=False)
+        covered = drawing.coverage(points, strokes, rows, columns)
         image = drawing.paint(image, covered)
     return Aligned(image, _proprio(tcp, opening, view_camera, spec.layout), valid)

@@ -26,8 +26,13 @@ def channel(packed: jax.Array, index: int) -> jax.Array:
     return ((packed >> (8 * index)) & 255).astype(jnp.int32).astype(jnp.float32)
 
 
-def unpack(channels: Sequence[jax.Array]) -> jax.Array:
-    """Three float32 planes in 0..255 -> uint8 [..., 3], rounded to nearest."""
-    red, green, blue = ((plane + 0.5).astype(jnp.int32) for plane in channels)
-    packed = (red | (green << 8) | (blue << 16)).astype(jnp.uint32)
+def unpack_words(packed: jax.Array) -> jax.Array:
+    """uint32 [...] -> uint8 [..., 3]."""
     return lax.bitcast_convert_type(packed, jnp.uint8)[..., :3]
+
+
+def unpack(channels: Sequence[jax.Array], *, half: float = 0.5) -> jax.Array:
+    """Three float32 planes in 0..255 -> uint8 [..., 3], rounded to nearest; truncated with `half`
+    of 0."""
+    red, green, blue = ((plane + half).astype(jnp.int32) for plane in channels)
+    return unpack_words((red | (green << 8) | (blue << 16)).astype(jnp.uint32))
