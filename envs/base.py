@@ -507,14 +507,21 @@ class Env:
         """What a policy sees: the aligned image [size, size, 3] uint8 and proprioception.
 
         Only the pixels of the policy's window are rendered, at the policy's resolution. `frame` is
-        the side of the virtual full image that a `border="shift"` window must stay inside.
+        the side of the virtual full image that a `border="shift"` window must stay inside. With
+        `spec.isolate` the gripper and the task's objects are shown, as the simulator knows them.
         """
         view, origin = self._window(state, params, spec, frame)
         true_view = spec.view_camera(self.camera(state, params, frame=frame))
         window = Window(origin, spec.size, spec.size)
-        image = render(self.scene(state, params), true_view, window).rgb
-        assert image is not None
-        return align_window(image, view, origin, self.tcp(state), self.opening(state), spec)
+        outputs = ("rgb", "segmentation") if spec.isolate else ("rgb",)
+        seen = render(self.scene(state, params), true_view, window, outputs=outputs)
+        assert seen.rgb is not None
+        mask = None
+        if spec.isolate:
+            assert seen.segmentation is not None
+            mask = jnp.isin(seen.segmentation, jnp.asarray(self.scene_model.handled))
+        tcp, opening = self.tcp(state), self.opening(state)
+        return align_window(seen.rgb, view, origin, tcp, opening, spec, mask=mask)
 
     def window_camera(
         self, state: State, params: EnvParams, spec: AlignSpec, *, frame: int = WIDE_FRAME

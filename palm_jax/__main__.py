@@ -25,6 +25,7 @@ class Verb(NamedTuple):
 VERBS: dict[str, Verb] = {
     "train": Verb("palm_jax.train.__main__", "collect demonstrations, train, evaluate, report"),
     "sweep": Verb("palm_jax.train.sweep", "success over a grid of shifts, for a finished run"),
+    "table": Verb("palm_jax.train.table", "every cell of the paper's main table, resumable"),
     "report": Verb("palm_jax.train.report", "one self-contained HTML page from run folders"),
     "show": Verb("palm_jax.train.show", "pictures of every task, robot and shift, as PNG"),
     "bench": Verb("benchmarks.__main__", "speed, side by side with peers (needs a checkout)"),

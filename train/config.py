@@ -131,7 +131,8 @@ class Config:
         """Raises ConfigError for values that cannot work."""
         _known("task", [self.task], TASKS)
         _known("robot", [self.robot], ROBOTS)
-        _known("method", self.method, methods.METHODS)
+        for method in self.method:
+            _known("method", method.split("+"), methods.METHODS)
         if self.other_robot:
             _known("robot", [self.other_robot], ROBOTS)
         if self.other_robot == self.robot:

@@ -13,7 +13,7 @@ Actions are what was commanded, so that jump is in none of them.
 import dataclasses
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from palm_jax.align import AlignSpec, Camera
-from palm_jax.envs.base import PAPER_FRAME, Env, EnvParams
+from palm_jax.envs.base import PAPER_FRAME, Env, EnvParams, State
 from palm_jax.envs.expert import Demonstrator, Recording
 from palm_jax.envs.rollout import Runner, repeat_params, take_params
 
@@ -247,6 +247,24 @@ def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None
     )
 
 
+def states(runner: Runner, demos: Demos) -> Iterator[tuple[State, EnvParams]]:
+    """Every frame of the demonstrations as states to look at, `runner.worlds` at a time; the last
+    batch is filled up with the last frame."""
+    total, worlds = len(demos.qpos), runner.worlds
+    for first in range(0, total, worlds):
+        rows = np.minimum(np.arange(first, first + worlds), total - 1)
+        episode = demos.episode[rows]
+        params = take_params(demos.params, episode)
+        state = runner.restore(
+            jnp.asarray(demos.qpos[rows]),
+            jnp.asarray(demos.mocap_pos[episode], jnp.float32),
+            jnp.asarray(demos.mocap_quat[episode], jnp.float32),
+            jnp.asarray(demos.camera_to_world[episode], jnp.float32),
+            params,
+        )
+        yield state, params
+
+
 def render_observations(
     runner: Runner, demos: Demos, spec: AlignSpec, *, frame: int
 ) -> tuple[np.ndarray, np.ndarray, Camera]:
@@ -261,19 +279,9 @@ def render_observations(
       images [N, size, size, 3] uint8, proprioception [N, P] float32, and the cameras of the images
       (leaves [N, ...]).
     """
-    total, worlds = len(demos.qpos), runner.worlds
+    total = len(demos.qpos)
     images, proprio, cameras = [], [], []
-    for first in range(0, total, worlds):
-        rows = np.minimum(np.arange(first, first + worlds), total - 1)
-        episode = demos.episode[rows]
-        params = take_params(demos.params, episode)
-        state = runner.restore(
-            jnp.asarray(demos.qpos[rows]),
-            jnp.asarray(demos.mocap_pos[episode], jnp.float32),
-            jnp.asarray(demos.mocap_quat[episode], jnp.float32),
-            jnp.asarray(demos.camera_to_world[episode], jnp.float32),
-            params,
-        )
+    for state, params in states(runner, demos):
         seen = runner.observe(state, params, spec, frame=frame)
         images.append(np.asarray(seen.image))
         proprio.append(np.asarray(seen.proprio))

@@ -1,10 +1,15 @@
-"""One table of methods: what a policy sees, and how its training images are augmented."""
+"""One table of methods: what a policy sees, what is made of the demonstrations, how training images
+are augmented.
+
+Parts compose: `find("palm+mirrorduo")` is PALM on the demonstrations of MirrorDuo.
+"""
 
 import dataclasses
 
 from palm_jax.align import AlignSpec
 from palm_jax.envs.base import PAPER_FRAME, WIDE_FRAME
 from palm_jax.envs.tasks import Task
+from palm_jax.train.transforms import Transform, mirrored, novel_views, rerendered
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,6 +24,8 @@ class Method:
       overlay: whether the TCP axes are drawn.
       augment: whether Random Overlay and perspective run in training.
       frame: side in pixels of the virtual full image that a crop is clamped to.
+      isolate: whether only the gripper and the task's objects are shown.
+      transforms: of the training set, one after the other; see `palm_jax.train.transforms`.
       hand: evaluations under a turned camera: "aligned" (the hand's initial yaw turns with the
         camera, as in the authors' code for PALM), or "both": with and without, the better one
         quoted.
@@ -32,6 +39,8 @@ class Method:
     augment: bool
     frame: int
     hand: str
+    isolate: bool = False
+    transforms: tuple[Transform, ...] = ()
 
     def spec(self, task: Task, size: int) -> AlignSpec:
         """The alignment for a task's crop at `size` x `size` pixels."""
@@ -41,52 +50,105 @@ class Method:
             size=size,
             overlay=self.overlay,
             layout=self.layout,
+            isolate=self.isolate,
         )
 
+
+PALM = Method(
+    name="palm",
+    title="PALM: TCP crop, axes overlay, camera-frame proprioception, augmentation",
+    layout="cam6d_z",
+    crop=True,
+    overlay=True,
+    augment=True,
+    frame=WIDE_FRAME,
+    hand="aligned",
+)
+BC = Method(
+    name="bc",
+    title="plain behaviour cloning: full image, world-frame pose",
+    layout="world6d_xyz",
+    crop=False,
+    overlay=False,
+    augment=False,
+    frame=PAPER_FRAME,
+    hand="both",
+)
 
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
-        Method(
-            name="palm",
-            title="PALM: TCP crop, axes overlay, camera-frame proprioception, augmentation",
-            layout="cam6d_z",
-            crop=True,
-            overlay=True,
-            augment=True,
-            frame=WIDE_FRAME,
-            hand="aligned",
-        ),
-        Method(
+        PALM,
+        dataclasses.replace(
+            PALM,
             name="palm-paper-frame",
             title="PALM with the crop clamped to the paper's 512-pixel frame",
-            layout="cam6d_z",
-            crop=True,
-            overlay=True,
-            augment=True,
             frame=PAPER_FRAME,
-            hand="aligned",
         ),
-        Method(
-            name="bc",
-            title="plain behaviour cloning: full image, world-frame pose",
-            layout="world6d_xyz",
+        dataclasses.replace(
+            PALM,
+            name="palm-crop",
+            title="PALM without the crop: the full image",
             crop=False,
-            overlay=False,
-            augment=False,
             frame=PAPER_FRAME,
-            hand="both",
+        ),
+        dataclasses.replace(
+            PALM, name="palm-overlay", title="PALM without the axes overlay", overlay=False
+        ),
+        dataclasses.replace(
+            PALM, name="palm-aug", title="PALM without augmentation", augment=False
+        ),
+        dataclasses.replace(
+            PALM,
+            name="palm-prop",
+            title="PALM with BC's world-frame pose",
+            layout="world6d_xyz",
+        ),
+        BC,
+        dataclasses.replace(
+            BC,
+            name="mirrorduo",
+            title="MirrorDuo: BC, and every demonstration in the mirror",
+            transforms=(mirrored,),
+        ),
+        dataclasses.replace(
+            BC,
+            name="roviaug",
+            title="RoVi-Aug, viewpoints only: BC, and every frame from a moved camera (surrogate: "
+            "rendered again and degraded)",
+            transforms=(novel_views(rerendered),),
+        ),
+        dataclasses.replace(
+            BC,
+            name="arro",
+            title="ARRO: BC on the gripper and the task's objects alone, true masks",
+            isolate=True,
         ),
     )
 }
 
 
 def find(name: str) -> Method:
-    """A method by name.
+    """A method by name; "palm+mirrorduo" is PALM with what the baselines behind it add.
 
     Raises:
       ValueError: unknown; the message lists the known ones.
     """
-    if name not in METHODS:
-        raise ValueError(f"unknown method {name!r}; known: {', '.join(METHODS)}")
-    return METHODS[name]
+    first, *rest = name.split("+")
+    for part in (first, *rest):
+        if part not in METHODS:
+            raise ValueError(f"unknown method {part!r}; known: {', '.join(METHODS)}")
+    method = METHODS[first]
+    for part in rest:
+        method = _with(method, METHODS[part])
+    return dataclasses.replace(method, name=name)
+
+
+def _with(method: Method, other: Method) -> Method:
+    """`method` with the transforms and the isolation of `other`."""
+    return dataclasses.replace(
+        method,
+        title=f"{method.title}; with {other.title}",
+        isolate=method.isolate or other.isolate,
+        transforms=(*method.transforms, *other.transforms),
+    )

@@ -26,6 +26,7 @@ from palm_jax.train import (
     records,
     report,
     sweep,
+    transforms,
     videos,
     workspace,
 )
@@ -38,6 +39,7 @@ _FILMED = ("workspace+viewpoint", "workspace+viewpoint+embodiment")
 """Domains of which videos are made, where they are evaluated."""
 
 _BANK = 128  # background textures for Random Overlay
+_TRANSFORM_KEY = 1 << 20  # apart from the keys of the demonstrations
 _SELECTION_SEED = 500  # scenes that score checkpoints: never those of the evaluation
 
 
@@ -182,6 +184,10 @@ def _one_method(
     batch = learner.Batch(
         {VIEW: images}, proprio, data.actions, cameras={VIEW: cameras}, tcp=data.tcp[:, :3, 3]
     )
+    source = transforms.Source(runner, data, spec, method.frame, VIEW)
+    for index, transform in enumerate(method.transforms):
+        key = jax.random.fold_in(jax.random.key(config.demo_seed), _TRANSFORM_KEY + index)
+        batch = transform(key, source, batch)
     _train(config, evaluator, batch, folder, console)
     _evaluate(config, evaluator, folder, console)
 

@@ -31,7 +31,11 @@ from palm_jax.align import camera as cam
 from palm_jax.align import crop as cropping
 from palm_jax.align import overlay as drawing
 from palm_jax.align import pixels
+from palm_jax.align.isolate import isolate
 from palm_jax.align.proprio import LAYOUTS, _proprio
+
+GRID = 32.0
+"""Pixels of the camera image between two lines of the grid behind isolated things."""
 
 
 @jax.tree_util.register_static
@@ -48,6 +52,8 @@ class AlignSpec:
       border: "shift", "edge" or "constant", see `tcp_crop`.
       axis_length: of the overlay, metres.
       thickness, arrow_length, arrow_width, dot_radius: of the overlay, pixels of the camera image.
+      isolate: show only what a mask says, on a black grid (`palm_jax.align.isolate`); the mask is
+        passed along with the image.
       frame: rows of the camera image that the stroke sizes refer to. Only `align_window` with
         crop=None needs it: nothing else tells how much its image was scaled.
 
@@ -66,6 +72,7 @@ class AlignSpec:
     arrow_length: float = 10.0
     arrow_width: float = 10.0
     dot_radius: float = 5.0
+    isolate: bool = False
     frame: int = 512
 
     def __post_init__(self) -> None:
@@ -160,10 +167,13 @@ def _align(
     tcp: jax.Array,
     opening: jax.Array,
     spec: AlignSpec,
+    mask: jax.Array | None,
     crop_jitter: Vector | None,
     overlay_jitter: Vector | None,
 ) -> Aligned:
     uv, valid = _seen(camera, tcp)
+    if mask is not None:
+        image = isolate(image, mask, pitch=GRID)
     rows, columns = jnp.arange(camera.height), jnp.arange(camera.width)
     if spec.crop is not None:
         # The window is cut before drawing, so that only its pixels are touched. Strokes depend on
@@ -197,6 +207,7 @@ def align(
     opening: ArrayLike,
     spec: AlignSpec,
     *,
+    mask: ArrayLike | None = None,
     crop_jitter: Vector | None = None,
     overlay_jitter: Vector | None = None,
 ) -> Aligned:
@@ -211,6 +222,7 @@ def align(
       tcp: [4, 4] TCP pose in the world, z the approach direction, y the opening axis.
       opening: gripper opening, 0 closed to 1 open.
       spec: what to do.
+      mask: bool [H, W] of what is shown; only with `spec.isolate`, which comes before all else.
       crop_jitter: [2] (u, v) pixels added to the TCP before cropping, as a calibration error would
         do; the reference rounds it to whole pixels.
       overlay_jitter: [2] (u, v) pixels added to the overlay, drawn independently of the other.
@@ -224,7 +236,8 @@ def align(
     Raises:
       ShapeError, DtypeError: image not [H, W, 3] of uint8 or float, not the camera's size; tcp not
         [4, 4].
-      OptionError: crop larger than the image; concrete float pixels outside [0, 1].
+      OptionError: crop larger than the image; concrete float pixels outside [0, 1]; a mask without
+        `spec.isolate`, or that without a mask.
       CameraError, PoseError: see `Camera.check`; concrete tcp not a rigid pose.
       ProjectionError: concrete TCP behind the camera or outside its image.
     """
@@ -238,7 +251,17 @@ def align(
     check_pose(tcp, "tcp")
     cam.check_tcp_in_view(camera, tcp, "tcp")
     check_unit_range(image, "image")
-    return _align(image, camera, tcp, opening, spec, crop_jitter, overlay_jitter)
+    checked = _mask(mask, spec)
+    return _align(image, camera, tcp, opening, spec, checked, crop_jitter, overlay_jitter)
+
+
+def _mask(mask: ArrayLike | None, spec: AlignSpec) -> jax.Array | None:
+    if (mask is not None) != spec.isolate:
+        raise OptionError(
+            f"mask: expected one if and only if AlignSpec.isolate, which is {spec.isolate}; got "
+            f"{'none' if mask is None else 'one'}"
+        )
+    return None if mask is None else jnp.asarray(mask, bool)
 
 
 def window_origin(
@@ -292,6 +315,7 @@ def align_window(
     opening: ArrayLike,
     spec: AlignSpec,
     *,
+    mask: ArrayLike | None = None,
     jitter: Vector | None = None,
 ) -> Aligned:
     """`align` for an image that was rendered as the policy's window: overlay and proprioception.
@@ -306,6 +330,7 @@ def align_window(
       tcp: [4, 4] TCP pose in the world.
       opening: gripper opening, 0 closed to 1 open.
       spec: the policy's spec.
+      mask: bool [size, size] of what is shown; only with `spec.isolate`.
       jitter: [2] (u, v) overlay jitter, pixels of the unscaled camera.
 
     Returns:
@@ -314,6 +339,7 @@ def align_window(
 
     Raises:
       ShapeError, DtypeError: image not [size, size, 3] of uint8 or float; tcp not [4, 4].
+      OptionError: a mask without `spec.isolate`, or that without a mask.
     """
     image = as_image(image, "image", rgb=True)
     if image.shape[:2] != (spec.size, spec.size):
@@ -324,7 +350,8 @@ def align_window(
     tcp = as_single(tcp, "tcp", (4, 4))
     opening = as_single(opening, "opening", ())
     origin = jnp.asarray(origin, jnp.int32)
-    return _align_window(image, view_camera, origin, tcp, opening, spec, jitter)
+    checked = _mask(mask, spec)
+    return _align_window(image, view_camera, origin, tcp, opening, spec, checked, jitter)
 
 
 @jax.jit
@@ -335,9 +362,12 @@ def _align_window(
     tcp: jax.Array,
     opening: jax.Array,
     spec: AlignSpec,
+    mask: jax.Array | None,
     jitter: Vector | None,
 ) -> Aligned:
     _, valid = _seen(view_camera, tcp)
+    if mask is not None:
+        image = isolate(image, mask, pitch=max(GRID * spec.scale, 2.0))
     if spec.overlay:
         points = drawing.overlay_points(view_camera, tcp, spec.axis_length)
         points = _jittered(points, None if jitter is None else spec.scale * jnp.asarray(jitter))

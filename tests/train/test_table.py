@@ -1,0 +1,174 @@
+"""The order of a table's cells, and that none is lost, mixed or done twice. Training is faked."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from palm_jax.train import config as configuration
+from palm_jax.train import table
+from palm_jax.train.config import Config, ConfigError
+from palm_jax.train.table import TableConfig
+
+SMALL = TableConfig(
+    preset="quick", tasks=("lift_lid", "lift_spam"), methods=("arro", "bc", "palm"), seeds=(0, 1)
+)
+
+
+class Trainer:
+    """Stands in for the training process."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.asked: list[str] = []
+        self.failing: set[str] = set()
+        self.stop_at: str | None = None
+        monkeypatch.setattr(table, "_train", self)
+
+    def __call__(self, config: Config, log: Path) -> int:
+        assert config.out is not None
+        name = f"{config.task}/{config.out.name}"
+        self.asked.append(name)
+        if name == self.stop_at:
+            raise KeyboardInterrupt
+        if name in self.failing:
+            return 3
+        config.out.mkdir(parents=True, exist_ok=True)
+        count = {"successes": len(self.asked), "episodes": 24, "nan": 0}
+        (config.out / "eval.json").write_text(json.dumps({"in_domain": count}))
+        return 0
+
+
+@pytest.fixture
+def trainer(monkeypatch: pytest.MonkeyPatch) -> Trainer:
+    return Trainer(monkeypatch)
+
+
+def run(config: TableConfig) -> int:
+    words = ["--preset", config.preset, "--tasks", *config.tasks, "--methods", *config.methods]
+    words += ["--seeds", *map(str, config.seeds), "--shard", config.shard]
+    words += ["--out", str(config.folder), "--json", str(config.file)]
+    if config.merge:
+        words += ["--merge", *map(str, config.merge)]
+    return table.main(words)
+
+
+def test_palm_and_bc_come_first() -> None:
+    names = [cell.name for cell in table.cells(SMALL)]
+    assert names[:5] == [
+        "lift_lid/palm-s0", "lift_spam/palm-s0", "lift_lid/palm-s1", "lift_spam/palm-s1",
+        "lift_lid/bc-s0",
+    ]  # fmt: skip
+    assert len(names) == 12 and names[-1] == "lift_spam/arro-s1"
+
+
+def test_shards_divide_the_cells() -> None:
+    parts = [
+        {cell.name for cell in table.cells(dataclasses.replace(SMALL, shard=f"{i}/5"))}
+        for i in range(1, 6)
+    ]
+    assert sum(map(len, parts)) == 12 and len(set().union(*parts)) == 12
+
+
+def test_a_cell_is_a_training_command(tmp_path: Path) -> None:
+    config = dataclasses.replace(SMALL, out=tmp_path)
+    cell = table.cell_config(config, table.Cell("lift_spam", "arro", 1))
+    again = configuration.parse(configuration.command(cell)[3:])
+    assert again == cell
+    assert again.method == ("arro",) and again.seed == 1 and not again.sweep
+    # Demonstrations are of the task alone.
+    other = table.cell_config(config, table.Cell("lift_spam", "palm", 0))
+    assert cell.data == other.data and cell.out != other.out
+
+
+def test_a_stop_loses_the_running_cell_alone(tmp_path: Path, trainer: Trainer) -> None:
+    config = dataclasses.replace(SMALL, out=tmp_path, seeds=(0,))
+    trainer.stop_at = "lift_lid/bc-s0"
+    assert run(config) == 130
+    stored = json.loads(config.file.read_text())
+    assert stored["results"]["lift_spam"]["palm"]["0"]["in_domain"]["successes"] == 2
+    trainer.stop_at = None
+    assert run(config) == 0
+    assert trainer.asked == [
+        "lift_lid/palm-s0", "lift_spam/palm-s0", "lift_lid/bc-s0",
+        "lift_lid/bc-s0", "lift_spam/bc-s0", "lift_lid/arro-s0", "lift_spam/arro-s0",
+    ]  # fmt: skip
+    before = config.file.read_bytes()
+    assert run(config) == 0 and len(trainer.asked) == 7 and config.file.read_bytes() == before
+
+
+def test_a_failed_cell_is_named_and_the_others_go_on(
+    tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = dataclasses.replace(SMALL, out=tmp_path, seeds=(0,), methods=("palm",))
+    trainer.failing = {"lift_lid/palm-s0"}
+    assert run(config) == 1
+    stored = json.loads(config.file.read_text())
+    log = stored["failed"]["lift_lid"]["palm"]["0"]
+    assert log == str(tmp_path / "lift_lid/palm-s0.log")
+    assert set(stored["results"]) == {"lift_spam"}
+    assert "lift_lid/palm-s0 failed (exit code 3)" in capsys.readouterr().out.replace("\n", " ")
+    trainer.failing = set()  # it is tried again, and no failure remains
+    assert run(config) == 0
+    assert set(json.loads(config.file.read_text())["results"]) == {"lift_lid", "lift_spam"}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("preset",), "preset = 'cpu', now it is 'quick'"),
+        (("recipe", "steps"), "recipe.steps = 'cpu', now it is 2400"),
+        (("versions", "jax"), "versions.jax = 'cpu', now it is"),
+    ],
+)
+def test_other_conditions_are_refused_by_name(
+    change: tuple[str, ...],
+    words: str,
+    tmp_path: Path,
+    trainer: Trainer,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = dataclasses.replace(SMALL, out=tmp_path, seeds=(0,), methods=("palm",))
+    assert run(config) == 0
+    stored = json.loads(config.file.read_text())
+    place = stored["header"]
+    for name in change[:-1]:
+        place = place[name]
+    place[change[-1]] = "cpu"
+    config.file.write_text(json.dumps(stored))
+    before = config.file.read_bytes()
+    assert run(dataclasses.replace(config, methods=("bc",))) == 2
+    assert words in capsys.readouterr().err
+    assert config.file.read_bytes() == before and len(trainer.asked) == 2
+
+
+def test_shards_are_merged(tmp_path: Path, trainer: Trainer) -> None:
+    parts = [
+        dataclasses.replace(SMALL, out=tmp_path / str(i), shard=f"{i}/2", seeds=(0,))
+        for i in (1, 2)
+    ]
+    assert [run(part) for part in parts] == [0, 0]
+    whole = dataclasses.replace(
+        SMALL, out=tmp_path / "whole", seeds=(0,), merge=tuple(part.file for part in parts)
+    )
+    assert run(whole) == 0
+    found = json.loads(whole.file.read_text())["results"]
+    assert {(t, m) for t, row in found.items() for m in row} == {
+        (task, method) for task in SMALL.tasks for method in SMALL.methods
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"tasks": ("lid",)}, "unknown task 'lid'; known: lift_lid"),
+        ({"methods": ("plam",)}, "unknown method 'plam'; known: palm"),
+        ({"preset": "huge"}, "unknown preset 'huge'; known: quick"),
+        ({"shard": "3/2"}, "shard: expected i/n with i from 1 to n, got '3/2'"),
+        ({"seeds": (1, 1)}, "seeds: expected one or more, each once"),
+    ],
+)
+def test_what_does_not_exist_is_refused(change: dict, words: str) -> None:
+    with pytest.raises(ConfigError, match="unknown|expected") as error:
+        table.cells(dataclasses.replace(SMALL, **change))
+    assert words in str(error.value)

@@ -1,0 +1,332 @@
+"""`python -m palm_jax table`: the paper's main table, every cell a policy that is trained and
+evaluated.
+
+A cell is a task, a method and a seed: one training command in a process of its own, so that a crash
+costs that cell alone, and a second call goes on where the first one ended. Demonstrations are made
+once for each task. Finished cells go into one JSON file at once:
+
+    {"header": {...}, "results": {task: {method: {seed: {domain: {"successes", "episodes",
+    "nan"}}}}}, "failed": {task: {method: {seed: log}}}}
+
+The header says under which conditions; a file with another one is not touched.
+"""
+
+import dataclasses
+import datetime
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import tyro
+from rich.console import Console
+
+from palm_jax.envs.registry import TASKS
+from palm_jax.envs.shifts import DOMAINS
+from palm_jax.train import config as configuration
+from palm_jax.train import console as terminal
+from palm_jax.train import methods, records, workspace
+from palm_jax.train.config import Config, ConfigError
+from palm_jax.train.metrics import plain, write_json
+
+_FIRST = ("palm", "bc")
+"""Methods whose cells come first: the claim stands and falls with them."""
+
+_OTHER = ("palm-crop", "palm-overlay", "palm-aug", "palm-prop", "mirrorduo", "roviaug", "arro")
+_TASKS = ("lift_lid", "lift_spam", "insert_peg", "rearrange_veggies")
+_KEPT = (
+    "robot", "other_robot", "demos", "demo_seed", "demo_noise", "image_size", "random_crop",
+    "width", "norm", "steps", "batch_size", "learning_rate", "schedule", "warmup_steps",
+    "weight_decay", "ema", "overlay_warmup", "perspective", "turn", "select_from",
+    "select_scenes", "checkpoint_every", "scenes", "eval_seed",
+)  # fmt: skip
+"""The recipe: fields of the configuration that decide what comes out of a cell."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TableConfig:
+    """Train and evaluate every cell of the paper's main table; goes on where it was stopped.
+
+    Attributes:
+      preset: quick, cpu or paper.
+      tasks: rows.
+      methods: columns; palm and bc are run first.
+      seeds: of training.
+      out: folder of the cells and the demonstrations; by default runs/table-PRESET.
+      json: where the results are collected; by default OUT/table.json.
+      shard: "i/n", the i-th of n machines (from 1): it takes every n-th cell. Each has its own
+        folder and file; `--merge` joins the files.
+      merge: files of other shards whose results are taken over; nothing is run.
+    """
+
+    preset: str = "cpu"
+    tasks: tuple[str, ...] = _TASKS
+    methods: tuple[str, ...] = (*_FIRST, *_OTHER)
+    seeds: tuple[int, ...] = (0,)
+    out: Path | None = None
+    json: Path | None = None
+    shard: str = "1/1"
+    merge: tuple[Path, ...] = ()
+
+    @property
+    def folder(self) -> Path:
+        """`out`, its default resolved."""
+        return self.out or Path("runs") / f"table-{self.preset}"
+
+    @property
+    def file(self) -> Path:
+        """`json`, its default resolved."""
+        return self.json or self.folder / "table.json"
+
+
+class Cell(NamedTuple):
+    """One policy."""
+
+    task: str
+    method: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.task}/{self.method}-s{self.seed}"
+
+
+def cells(config: TableConfig) -> list[Cell]:
+    """Those of this shard, in the order in which they are run: a method's over all tasks before the
+    next method's, palm and bc first.
+
+    Raises:
+      ConfigError: an unknown preset, task or method, or a shard that is none.
+    """
+    _check(config)
+    order = [*_FIRST, *[name for name in config.methods if name not in _FIRST]]
+    every = [
+        Cell(task, method, seed)
+        for method in order
+        if method in config.methods
+        for seed in config.seeds
+        for task in config.tasks
+    ]
+    index, count = _shard(config.shard)
+    return every[index - 1 :: count]
+
+
+def _check(config: TableConfig) -> None:
+    if config.preset not in configuration.PRESETS:
+        raise ConfigError(
+            f"unknown preset {config.preset!r}; known: {', '.join(configuration.PRESETS)}"
+        )
+    for task in config.tasks:
+        if task not in TASKS:
+            raise ConfigError(f"unknown task {task!r}; known: {', '.join(TASKS)}")
+    for method in config.methods:
+        try:
+            methods.find(method)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+    for name in ("tasks", "methods", "seeds"):
+        values = getattr(config, name)
+        if not values or len(set(values)) < len(values):
+            raise ConfigError(f"{name}: expected one or more, each once, got {values}")
+
+
+def _shard(text: str) -> tuple[int, int]:
+    index, _, count = text.partition("/")
+    if index.isdigit() and count.isdigit() and 1 <= int(index) <= int(count):
+        return int(index), int(count)
+    raise ConfigError(f"shard: expected i/n with i from 1 to n, got {text!r}")
+
+
+def cell_config(config: TableConfig, cell: Cell) -> Config:
+    """The training command of a cell."""
+    return dataclasses.replace(
+        configuration.PRESETS[config.preset](),
+        task=cell.task,
+        method=(cell.method,),
+        seed=cell.seed,
+        out=config.folder / cell.name,
+        data=config.folder / "demos" / f"{cell.task}.hdf5",
+        domains=DOMAINS,
+        sweep=False,
+    )
+
+
+# -- the file --------------------------------------------------------------------------------------
+
+
+def header(config: TableConfig) -> dict[str, Any]:
+    """The conditions under which the cells of a file were made."""
+    preset = configuration.PRESETS[config.preset]()
+    found = workspace.environment(preset, wall_s=0.0)
+    recipe = {name: getattr(preset, name) for name in _KEPT} | {"other_robot": preset.second_robot}
+    return {
+        "preset": config.preset,
+        "recipe": plain(recipe),
+        "domains": list(DOMAINS),
+        "versions": found["versions"],
+        "machine": found["machine"],
+        "devices": found["devices"],
+        "commit": found["commit"],
+    }
+
+
+_MUST_AGREE = ("preset", "recipe", "domains", "versions")
+
+
+def read(path: Path, fresh: dict[str, Any]) -> dict[str, Any]:
+    """The file's content, or an empty table under this header.
+
+    Raises:
+      ConfigError: it was made under other conditions; the message names the field.
+    """
+    if not path.exists():
+        return {"header": fresh, "results": {}, "failed": {}}
+    table: dict[str, Any] = records.load_json(path)
+    old = table.get("header", {})
+    for name in _MUST_AGREE:
+        if old.get(name) != fresh[name]:
+            raise ConfigError(
+                f"{path} was begun with {_difference(name, old.get(name), fresh[name])}: results "
+                "of two kinds are not mixed. Choose another --json and --out, or go back"
+            )
+    return table
+
+
+def _difference(name: str, old: Any, new: Any) -> str:
+    """The first entry in which they differ, in words."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in sorted(set(old) | set(new)):
+            if old.get(key) != new.get(key):
+                return f"{name}.{key} = {old.get(key)!r}, now it is {new.get(key)!r}"
+    return f"{name} = {old!r}, now it is {new!r}"
+
+
+def _put(table: dict[str, Any], part: str, cell: Cell, value: Any) -> None:
+    row = table.setdefault(part, {}).setdefault(cell.task, {})
+    row.setdefault(cell.method, {})[str(cell.seed)] = value
+
+
+def _get(table: dict[str, Any], part: str, cell: Cell) -> Any:
+    row = table.get(part, {}).get(cell.task, {})
+    return row.get(cell.method, {}).get(str(cell.seed))
+
+
+def _drop(table: dict[str, Any], part: str, cell: Cell) -> None:
+    table.get(part, {}).get(cell.task, {}).get(cell.method, {}).pop(str(cell.seed), None)
+
+
+# -- running ---------------------------------------------------------------------------------------
+
+
+def run(config: TableConfig, console: Console) -> Path:
+    """Runs what is missing; returns the file.
+
+    Raises:
+      ConfigError: see `cells` and `read`.
+      KeyboardInterrupt: the running cell was stopped; it resumes from its last checkpoint.
+    """
+    asked, fresh = cells(config), header(config)
+    table = read(config.file, fresh)
+    for path in config.merge:
+        _merge(table, path, fresh)
+    if config.merge:
+        write_json(config.file, table)
+        return config.file
+    missing = [cell for cell in asked if _get(table, "results", cell) is None]
+    console.print(f"{len(asked)} cells, {len(asked) - len(missing)} done, into {config.file}")
+    took: list[float] = []
+    for number, cell in enumerate(missing):
+        _announce(console, cell, len(missing) - number, took)
+        start = time.monotonic()
+        log = config.folder / f"{cell.name}.log"
+        code = _train(cell_config(config, cell), log)
+        counts = config.folder / cell.name / "eval.json"
+        table = read(config.file, fresh)  # another shard may write beside us
+        if code == 0 and counts.exists():
+            _put(table, "results", cell, records.load_counts(counts))
+            _drop(table, "failed", cell)
+            took.append(time.monotonic() - start)
+        else:
+            _put(table, "failed", cell, str(log))
+            console.print(f"{cell.name} failed (exit code {code}): see {log}", style="bold red")
+        write_json(config.file, table)
+    return config.file
+
+
+def _announce(console: Console, cell: Cell, left: int, took: list[float]) -> None:
+    if not took:
+        console.print(f"{cell.name}: {left} to go", highlight=False)
+        return
+    seconds = left * sum(took) / len(took)
+    end = datetime.datetime.now() + datetime.timedelta(seconds=seconds)
+    console.print(
+        f"{cell.name}: {left} to go, {terminal.duration(seconds)}, until about {end:%H:%M}"
+    )
+
+
+def _train(config: Config, log: Path) -> int:
+    """Runs a cell's command, or goes on with it; returns its exit code."""
+    assert config.out is not None and config.data is not None
+    resume = (config.out / "config.json").exists()
+    words = configuration.command(config, resume=resume)
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("a") as output:
+        output.write(f"$ {' '.join(words)}\n")
+        output.flush()
+        done = subprocess.run(
+            [sys.executable, *words[1:]],
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=_environment(config.data.parents[1]),
+            close_fds=False,
+        )
+    if done.returncode == 130:
+        raise KeyboardInterrupt
+    return done.returncode
+
+
+def _environment(folder: Path) -> dict[str, str]:
+    """The cells of a table share compiled programs."""
+    cache = {
+        "JAX_COMPILATION_CACHE_DIR": str((folder / "compiled").resolve()),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
+    }
+    return {**cache, **os.environ}
+
+
+def _merge(table: dict[str, Any], path: Path, fresh: dict[str, Any]) -> None:
+    other = read(path, fresh)
+    for part in ("results", "failed"):
+        for cell in _cells_of(other, part):
+            if _get(table, "results", cell) is None:
+                _put(table, part, cell, _get(other, part, cell))
+    for name in ("machine", "commit"):
+        seen = {str(table["header"].get(name)), str(other["header"].get(name))}
+        table["header"][name] = ", ".join(sorted(seen))
+
+
+def _cells_of(table: dict[str, Any], part: str) -> Iterator[Cell]:
+    for task, row in table.get(part, {}).items():
+        for method, seeds in row.items():
+            for seed in seeds:
+                yield Cell(task, method, int(seed))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command; returns the exit code."""
+    config = tyro.cli(TableConfig, args=argv, prog="python -m palm_jax table")
+    console = terminal.make_console()
+    try:
+        path = run(config, console)
+    except (ConfigError, records.RecordError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        console.print("Stopped; the same command goes on with what is missing.")
+        return 130
+    failed = list(_cells_of(records.load_json(path), "failed"))
+    console.print(f"Results: {path}" + (f"; {len(failed)} cells failed" if failed else ""))
+    return 1 if failed else 0
