@@ -8,6 +8,8 @@ that was measured beside it has its own, `details` all that was measured, the re
 
 import argparse
 import importlib
+import json
+import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -33,22 +35,50 @@ BENCHMARKS: dict[str, Benchmark] = {
 }
 
 
-def collect(names: Sequence[str]) -> dict[str, Any]:
-    """Runs benchmarks; the load is that before the first."""
-    result: dict[str, Any] = {"palm_jax": {}, **common.conditions(), "details": {}}
+def collect(names: Sequence[str], device: str = "") -> dict[str, Any]:
+    """Runs benchmarks, each in a process of its own: packages that are compared do not always bear
+    each other, and a crash is to cost one benchmark. The load is that before the first.
+
+    Returns:
+      the JSON; `failed` has the modules that ended badly, and how.
+    """
+    result: dict[str, Any] = {"palm_jax": {}, **common.conditions(), "details": {}, "failed": {}}
     for name in names:
         benchmark, found = BENCHMARKS[name], {}
         for module in benchmark.modules:
             print(f"bench {name}: {module}", file=sys.stderr, flush=True)
             start = time.perf_counter()
-            found[module] = importlib.import_module(f"benchmarks.{module}").run()
+            measured = _alone(module, device)
+            if isinstance(measured, str):
+                result["failed"][module] = measured
+            else:
+                found[module] = measured
             print(f"  {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
-        first = found[benchmark.modules[0]]
-        result["palm_jax"][benchmark.headline] = first[benchmark.headline]
-        for package, figures in first.get("peers", {}).items():
-            result.setdefault(package, {}).update(figures)
         result["details"][name] = found
+        first = found.get(benchmark.modules[0])
+        if first is not None:
+            result["palm_jax"][benchmark.headline] = first[benchmark.headline]
+            for package, figures in first.get("peers", {}).items():
+                result.setdefault(package, {}).update(figures)
     return result
+
+
+def _alone(module: str, device: str) -> dict[str, Any] | str:
+    """The result of one module, or how its process ended."""
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.alone", module, *([device] if device else [])],
+        cwd=Path(__file__).resolve().parents[1],
+        stdout=subprocess.PIPE,
+        text=True,
+        close_fds=False,
+    )
+    if done.returncode:
+        signal = f" (signal {-done.returncode})" if done.returncode < 0 else ""
+        message = f"exit code {done.returncode}{signal}"
+        print(f"  {module} failed: {message}", file=sys.stderr, flush=True)
+        return message
+    measured: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return measured
 
 
 def table(result: dict[str, Any]) -> str:
@@ -91,6 +121,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         help=f"any of {', '.join(BENCHMARKS)}, or all (the default); or worlds, which has options",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the JSON there as well")
+    parser.add_argument(
+        "--device", choices=("cpu", "gpu"), help="where JAX runs (default: where it likes to)"
+    )
     options = parser.parse_args(words)
     names = options.names or ["all"]
     unknown = [name for name in names if name not in (*BENCHMARKS, "all")]
@@ -98,10 +131,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(
             f"unknown benchmark {unknown[0]!r}; known: {', '.join(BENCHMARKS)}, all, worlds"
         )
-    result = collect(list(BENCHMARKS) if "all" in names else list(dict.fromkeys(names)))
+    if options.device:
+        try:
+            common.use(options.device)
+        except RuntimeError as error:
+            parser.error(str(error))
+    chosen = list(BENCHMARKS) if "all" in names else list(dict.fromkeys(names))
+    result = collect(chosen, options.device or "")
     common.publish(result, options.json)
     print(table(result), file=sys.stderr)
-    return 0
+    return 1 if result["failed"] else 0
 
 
 if __name__ == "__main__":

@@ -22,6 +22,11 @@ from palm_jax.envs.rollout import repeat_params
 SUBSTEPS = 10
 _PEER = "mujoco.rollout"
 
+_WORLDS: dict[str, tuple[int, ...]] = {
+    "cpu": (64, physics.MAX_CPU_WORLDS),
+    "gpu": (1024, 4096, 16384),
+}
+
 COMPILED = ("lift_spam", "panda")
 """The task and the robot whose compile time is measured."""
 
@@ -34,12 +39,13 @@ _COMPILE_CACHE = {
 }
 
 
-def run(*, worlds: tuple[int, ...] = (64, 128), repeats: int = 10) -> dict[str, Any]:
+def run(*, worlds: tuple[int, ...] | None = None, repeats: int = 10) -> dict[str, Any]:
     """Steps/s by robot and task; `steps_per_second` is that of lift_spam on panda at the number of
     worlds that is best.
 
     `worlds` are tried there; `robots` has every task on every robot at the last of them.
     """
+    worlds = worlds or _WORLDS.get(jax.default_backend(), _WORLDS["gpu"])
     robots: dict[str, dict[str, dict[str, Any]]] = {}
     for robot in ROBOTS:
         robots[robot] = {}

@@ -17,6 +17,23 @@ import numpy as np
 PACKAGES = ("palm-jax", "jax", "jaxlib", "flax", "mujoco", "mujoco-mjx", "numpy")
 
 
+def use(device: str) -> None:
+    """Makes JAX run on "cpu" or "gpu".
+
+    Raises:
+      RuntimeError: there is none.
+    """
+    jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda,cpu"}[device])
+    try:
+        found = jax.default_backend()
+    except RuntimeError as error:
+        raise RuntimeError(
+            f"--device {device}: JAX finds none ({error}); a GPU needs jax[cuda12]"
+        ) from error
+    if found != device:
+        raise RuntimeError(f"--device {device}: JAX runs on {found} already")
+
+
 def measure(call: Callable[[], Any], *, repeats: int, items: int) -> dict[str, float]:
     """Rates of `call`, which handles `items` things; its first run compiles and is reported alone.
 

@@ -98,7 +98,8 @@ def _physics(found: dict[str, Any]) -> Iterator[str]:
             rows.append(
                 [f"`{task}`, {robot}", _number(ours), _number(theirs), f"{theirs / ours:.1f}"]
             )
-    yield table(["128 worlds", _OURS, "C MuJoCo (`mujoco.rollout`)", "C is faster by"], rows)
+    worlds = f"{max(physics['by_worlds'], key=int)} worlds"
+    yield table([worlds, _OURS, "C MuJoCo (`mujoco.rollout`)", "C is faster by"], rows)
     plain, compiled = physics["plain_mjx"]["per_second_median"], physics["compile"]
     yield (
         f"`jax.jit(jax.vmap(mjx.step))` with default options, one world: {_number(plain)} steps a "
@@ -161,7 +162,7 @@ def text(result: dict[str, Any]) -> str:
         "after a warm-up; packages take turns."
     ]
     for name, section in SECTIONS.items():
-        if name in result["details"]:
+        if result["details"].get(name):
             parts += section(result["details"][name])
     return "\n\n".join(parts)
 

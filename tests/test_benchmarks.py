@@ -1,8 +1,6 @@
 """The bookkeeping of benchmarks; what they measure is not a matter of tests."""
 
 import json
-import sys
-import types
 from pathlib import Path
 
 import numpy as np
@@ -23,29 +21,37 @@ def test_calls_are_timed_in_turns():
         assert figures["per_second"] >= figures["per_second_median"] > 0
 
 
-def fake(monkeypatch: pytest.MonkeyPatch, name: str, result: dict) -> bench.Benchmark:
-    module = types.ModuleType(f"benchmarks.{name}")
-    module.run = lambda: result  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, module.__name__, module)
-    return bench.Benchmark((name,), "frames_per_second")
-
-
 def test_other_packages_have_their_own_entry(monkeypatch):
-    """`{"palm_jax": {...}, "peer": {...}}`, each with the headline figure."""
-    peers = {"slow": {"frames_per_second": 7.0}}
-    made = fake(monkeypatch, "bench_fake", {"frames_per_second": 42000.0, "peers": peers})
-    alone = fake(monkeypatch, "bench_alone", {"images_per_second": 5.0})
-    alone = alone._replace(headline="images_per_second")
-    monkeypatch.setattr(bench, "BENCHMARKS", {"render": made, "align": alone})
-    result = bench.collect(["render", "align"])
+    """`{"palm_jax": {...}, "peer": {...}}`, each with the headline figure; a benchmark that crashes
+    costs the others nothing."""
+    results = {
+        "bench_fake": {"frames_per_second": 42000.0, "peers": {"slow": {"frames_per_second": 7.0}}},
+        "bench_alone": {"images_per_second": 5.0},
+        "bench_broken": "exit code -11 (signal 11)",
+    }
+    monkeypatch.setattr(bench, "_alone", lambda module, device: results[module])
+    table = {
+        "render": bench.Benchmark(("bench_fake",), "frames_per_second"),
+        "train": bench.Benchmark(("bench_broken",), "samples_per_second"),
+        "align": bench.Benchmark(("bench_alone",), "images_per_second"),
+    }
+    monkeypatch.setattr(bench, "BENCHMARKS", table)
+    result = bench.collect(list(table))
     assert result["palm_jax"] == {"frames_per_second": 42000.0, "images_per_second": 5.0}
     assert result["slow"] == {"frames_per_second": 7.0}
+    assert result["failed"] == {"bench_broken": "exit code -11 (signal 11)"}
     rows = [line.split() for line in bench.table(result).splitlines()]
     assert rows == [
         ["palm_jax", "slow"],
         ["frames", "per", "second", "42,000", "7"],
         ["images", "per", "second", "5", "-"],
     ]
+
+
+def test_a_benchmark_runs_in_a_process_of_its_own(tmp_path: Path):
+    """What it prints does not matter, how it ends does."""
+    good, bad = (bench._alone(name, "") for name in ("common", "no_such_module"))
+    assert good == "exit code 1" and bad == "exit code 1"  # neither has a `run`
 
 
 def test_edges_are_where_a_neighbour_differs():
