@@ -1,15 +1,11 @@
 """MJX stepping that is fast on CPUs and on accelerators.
 
-Two facts of XLA's CPU backend shape this file (figures in docs/performance.md):
+XLA's default fusion emitters for CPUs make MJX hundreds of times slower (figures in
+docs/performance.md), so physics is compiled with `compiler_options()` of its own; the renderer and
+the networks want the default, so they live in other jits (`jit_physics` is for physics alone).
 
-* its default fusion emitters make MJX hundreds of times slower, so physics is compiled with
-  `compiler_options()` of its own; the renderer and the networks want the default, so they live in
-  other jits (`jit_physics` is for physics alone);
-* inside `lax.scan`, fusions recompute kinematics across MJX's stages unless an optimisation
-  barrier stands between them.
-
-And one of jaxlib's LAPACK calls, which wait inside the thread pool that they hand their work to:
-as many of them at a time as there are threads wait for ever (`_after_the_solver`).
+jaxlib's batched LAPACK calls wait inside the thread pool that they hand their work to: as many of
+them at a time as there are threads wait for ever (`_after_the_solver`).
 """
 
 import functools
@@ -65,8 +61,8 @@ def _after_the_solver(data: mjx.Data) -> mjx.Data:
     `mjx.implicit` factorises the mass matrix, the solver factorises its Hessian, and neither needs
     the other: XLA runs both at once. With two threads and a batch that LAPACK divides among threads
     (128 worlds of 21 degrees of freedom) each then holds one thread and waits for the other. The
-    zero, which XLA does not fold (it may be NaN), puts them in order; barriers do not, as they are
-    gone when thunks are scheduled.
+    zero, which XLA does not fold (it may be NaN), puts them in order; optimisation barriers do not,
+    as XLA drops them for CPUs.
     """
     zero = 0.0 * jnp.sum(data.qacc)
     return data.tree_replace({"_impl.M": data._impl.M + zero})
@@ -99,20 +95,8 @@ def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """One physics step: `mjx.step` for a model without tendons, sensors or moving cameras."""
     for stage in _STAGES:
-        data = _barrier(data, stage(model, data))
+        data = stage(model, data)
     return data
-
-
-def _barrier(before: mjx.Data, after: mjx.Data) -> mjx.Data:
-    """`after`, with a barrier round what a stage has changed: of a hundred arrays a few, and
-    tracing counts them all."""
-    old, structure = jax.tree.flatten(before)
-    new = jax.tree.leaves(after)
-    changed = [index for index, (a, b) in enumerate(zip(old, new, strict=True)) if a is not b]
-    held = jax.lax.optimization_barrier([new[index] for index in changed])
-    for index, value in zip(changed, held, strict=True):
-        new[index] = value
-    return jax.tree.unflatten(structure, new)
 
 
 def substeps(model: mjx.Model, data: mjx.Data, count: int) -> mjx.Data:

@@ -169,10 +169,8 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     )[tree.source]
     matrix = _matrix(quat)
     for up in tree.jumps:
-        pos, quat, matrix = jax.lax.optimization_barrier((pos, quat, matrix))
         pos = pos[up] + _turned(matrix[up], pos)
         quat, matrix = _quat_mul(quat[up], quat), _times(matrix[up], matrix)
-    pos, quat, matrix = jax.lax.optimization_barrier((pos, quat, matrix))
     owner = np.asarray(model.jnt_bodyid)
     is_free = np.isin(owner, tree.free)[:, None]
     at_rest = model.jnt_pos - jnp.where(tree.slide, shift, 0.0)[owner, None] * model.jnt_axis

@@ -289,12 +289,14 @@ def _train(config: Config, log: Path) -> int:
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    """The cells of a table share compiled programs."""
-    cache = {
+    """The cells of a table share compiled programs; and memory in large pages, which glibc must be
+    told before a process begins, trains a fifth faster (docs/performance.md)."""
+    ours = {
         "JAX_COMPILATION_CACHE_DIR": str((folder / "compiled").resolve()),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
+        "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
     }
-    return {**cache, **os.environ}
+    return {**ours, **os.environ}
 
 
 def _merge(table: dict[str, Any], path: Path, fresh: dict[str, Any]) -> None:

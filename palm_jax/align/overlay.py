@@ -215,8 +215,8 @@ def masks(points: Points, strokes: Strokes, rows: jax.Array, columns: jax.Array)
     x = columns.astype(jnp.float32) - points.uv[0, 0]
     y = rows.astype(jnp.float32) - points.uv[0, 1]
     # A row cuts a convex shape in one run of pixels: two comparisons a pixel instead of the
-    # distances to all its sides. The barrier keeps the divisions with the rows.
-    low, high = jax.lax.optimization_barrier(_runs(_planes(points, strokes, sharp=True), y))
+    # distances to all its sides.
+    low, high = _runs(_planes(points, strokes, sharp=True), y)
     inside = (x >= low[..., None]) & (x <= high[..., None])
     # PIL's disc in a box of +-r pixels holds the centres within about r + 3/8.
     radius = jnp.asarray(strokes.dot_radius, jnp.float32)
