@@ -2,7 +2,8 @@
 
 * `worlds.png`: the start of an episode, every task on every robot under every domain;
 * `TASK.png`: the expert's episode on every robot, with the moments before each change of stage;
-* `axes.png`: each single shift from its least to its greatest strength, for one task.
+* `axes.png`: each single shift from its least to its greatest strength, for one task;
+* `methods.png`: what every method sees of that task's scene, under some of the domains.
 """
 
 import dataclasses
@@ -22,7 +23,7 @@ from palm_jax.envs.base import Env, EnvParams, State
 from palm_jax.envs.rollout import Runner
 from palm_jax.envs.tasks import Stage
 from palm_jax.train import console as terminal
-from palm_jax.train import figures
+from palm_jax.train import figures, methods
 
 T = TypeVar("T")
 
@@ -46,7 +47,7 @@ _WINDOW = 84
 
 @dataclasses.dataclass(frozen=True)
 class ShowConfig:
-    """Pictures of the worlds: worlds.png, axes.png and one PNG for each task.
+    """Pictures of the worlds: worlds.png, axes.png, methods.png and one PNG for each task.
 
     Attributes:
       tasks: names; all of them if empty.
@@ -114,7 +115,6 @@ class Studio:
 
     def __init__(self, env: Env, worlds: int, size: int) -> None:
         self.env, self.runner = env, Runner(env, worlds)
-        self._spec = AlignSpec(crop=env.task.crop, offset=(0, 40), size=_WINDOW)
 
         def picture(state: State, params: EnvParams) -> jax.Array:
             rgb = env.render(state, params, size).rgb
@@ -124,22 +124,23 @@ class Studio:
         self._picture = jax.jit(jax.vmap(picture))
 
     def starts(
-        self, seed: int, params: Sequence[EnvParams], *, windows: bool = False
+        self, seed: int, params: Sequence[EnvParams], *, seen_by: methods.Method | None = None
     ) -> list[figures.ImageArray]:
         """The start of one and the same scene under each of `params`.
 
         Args:
           seed: of the scene.
           params: of one world each.
-          windows: whether to show what a policy sees, with its overlay, instead of the frame.
+          seen_by: whose policy's image to show instead of the frame.
         """
         worlds, taken = self.runner.worlds, []
         keys = jnp.broadcast_to(jax.random.key(seed), (worlds,))
         for batch in _batches(params, worlds):
             stacked = _stack(batch)
             state = self.runner.reset(keys, stacked)
-            if windows:
-                images = self.runner.observe(state, stacked, self._spec).image
+            if seen_by:
+                spec = seen_by.spec(self.env.task, _WINDOW)
+                images = self.runner.observe(state, stacked, spec, frame=seen_by.frame).image
             else:
                 images = self._picture(state, stacked)
             taken += list(np.asarray(images))
@@ -231,7 +232,7 @@ def show(config: ShowConfig, console: terminal.Console) -> list[Path]:
                 rows.append(f"{_words(task)}\n{robot}")
                 strips[robot] = studio.expert(config.seed)
                 if not files and robot == config.robots[0]:
-                    files.append(_axes(studio, config))
+                    files += [_axes(studio, config), _methods(studio, config)]
                     bar.advance()
                 studio.close()
                 bar.advance()
@@ -269,7 +270,8 @@ def _axes(studio: Studio, config: ShowConfig) -> Path:
             for strength, fits in zip(STRENGTHS, allowed, strict=True)
             if fits
         ]
-        taken = iter(studio.starts(config.seed, params, windows=name.startswith(_CALIBRATION)))
+        seen_by = methods.PALM if name.startswith(_CALIBRATION) else None
+        taken = iter(studio.starts(config.seed, params, seen_by=seen_by))
         pictures.append([next(taken) if fits else None for fits in allowed])
     task = _words(studio.env.task.name)
     figure = figures.picture_grid(
@@ -280,6 +282,31 @@ def _axes(studio: Studio, config: ShowConfig) -> Path:
         "(calibration: the policy's window with its overlay)",
     )
     return figures.save(figure, config.out / "axes.png")
+
+
+_SEEN = ("in_domain", "workspace", "viewpoint", "workspace+viewpoint")
+"""Columns of `methods.png`."""
+
+
+def _methods(studio: Studio, config: ShowConfig) -> Path:
+    """`methods.png`: one scene of one task as methods see it; who sees the same shares a row."""
+    default, task = studio.env.default_params(), studio.env.task
+    params = [shifts.shifted(default, domain) for domain in _SEEN]
+    rows: dict[tuple[AlignSpec, int], list[methods.Method]] = {}
+    for method in methods.METHODS.values():
+        # How the rest of the input looks does not show.
+        spec = dataclasses.replace(method.spec(task, _WINDOW), layout="z")
+        rows.setdefault((spec, method.frame), []).append(method)
+    pictures: list[list[figures.ImageArray | None]] = [[*studio.starts(config.seed, params)]]
+    pictures += [[*studio.starts(config.seed, params, seen_by=row[0])] for row in rows.values()]
+    names = ["the camera", *("\n".join(method.name for method in row) for row in rows.values())]
+    figure = figures.picture_grid(
+        pictures,
+        names,
+        [_words(domain) for domain in _SEEN],
+        title=f"What methods see: one scene of {_words(task.name)}, {studio.env.robot.name}",
+    )
+    return figures.save(figure, config.out / "methods.png")
 
 
 def _words(name: str) -> str:

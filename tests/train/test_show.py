@@ -67,7 +67,7 @@ class StubStudio:
     def grey(self, level: int) -> np.ndarray:
         return np.full((self.size, self.size, 3), level, np.uint8)
 
-    def starts(self, seed: int, params: list[Any], *, windows: bool = False) -> list[np.ndarray]:
+    def starts(self, seed: int, params: list[Any], *, seen_by: Any = None) -> list[np.ndarray]:
         return [self.grey(round(200 * float(p.camera_fovy) / 48)) for p in params]
 
     def expert(self, seed: int) -> tuple[list[np.ndarray], list[str]]:
@@ -80,12 +80,12 @@ class StubStudio:
 def test_files(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Through the command, with a stub for the renderer: the three kinds of files, and that the
+    """Through the command, with a stub for the renderer: the four kinds of files, and that the
     shift is in the pictures (a camera of 40 and of 48 degrees: grey 167 and 200)."""
     monkeypatch.setattr(show, "Studio", StubStudio)
     words = ["--tasks", "lift_lid", "--robots", "panda", "ur5", "--out", str(tmp_path / "new")]
     assert show.main([*words, "--domains", "in_domain", "field_of_view"]) == 0
-    names = ["worlds.png", "axes.png", "lift_lid.png"]
+    names = ["worlds.png", "axes.png", "methods.png", "lift_lid.png"]
     printed = capsys.readouterr().out.splitlines()
     assert {str(tmp_path / "new" / name) for name in names} <= set(printed)
     levels = {name: np.asarray(Image.open(tmp_path / "new" / name).convert("L")) for name in names}
