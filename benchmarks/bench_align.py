@@ -20,6 +20,8 @@ from palm_jax import align
 BATCHES = (64, 512)
 SIDE, FRAME = 84, 512
 SPEC = align.AlignSpec(size=SIDE)
+FRAMES, SMALL = 8, 64
+"""Images of 512 and of 84 pixels that are worked on together."""
 
 
 def run(*, repeats: int = 20) -> dict[str, Any]:
@@ -85,16 +87,23 @@ def _operations(data: others.Inputs) -> dict[str, Callable[[], Any]]:
     camera, tcps = _camera(), _tcps(len(data.frames))
     frames, small, backgrounds = map(jnp.asarray, (data.frames, data.small, data.backgrounds))
     corners, points = jnp.asarray(data.corners), jnp.asarray(data.points)
-    crop = jax.jit(jax.vmap(lambda i, uv: align.tcp_crop(i, uv, data.crop, offset=SPEC.offset)))
-    whole = jax.jit(jax.vmap(lambda i, t: tuple(align.align(i, camera, t, 1.0, SPEC))))
-    warp = jax.jit(jax.vmap(align.perspective_warp))
-    blend = jax.jit(jax.vmap(lambda i, b: align.overlay_blend(i, b, 0.5)))
+    crop = _in_blocks(lambda i, uv: align.tcp_crop(i, uv, data.crop, offset=SPEC.offset), FRAMES)
+    whole = _in_blocks(lambda i, t: tuple(align.align(i, camera, t, 1.0, SPEC)), FRAMES)
+    warp = _in_blocks(align.perspective_warp, SMALL)
+    blend = _in_blocks(lambda i, b: align.overlay_blend(i, b, 0.5), SMALL)
     return {
         "tcp_crop": lambda: crop(frames, points[:, 0]),
         "align": lambda: whole(frames, tcps),
         "perspective": lambda: warp(small, corners),
         "overlay": lambda: blend(small, backgrounds),
     }
+
+
+def _in_blocks(function: Callable[..., Any], size: int) -> Callable[..., Any]:
+    """`function` of a batch, so many images at a time: what is in between stays in the caches."""
+    return jax.jit(
+        lambda *arrays: jax.lax.map(lambda each: function(*each), arrays, batch_size=size)
+    )
 
 
 def _same_work(batch: int, repeats: int) -> dict[str, Any]:
