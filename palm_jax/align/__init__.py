@@ -2,7 +2,8 @@
 
 Conventions, here once for all functions:
 
-- One example, no batch axis; batch with `jax.vmap`. Augmentation takes batches. Everything runs
+- One example, no batch axis; batch with `jax.vmap`. (Frames of 512 pixels on a CPU: `jax.lax.map`
+  with `batch_size=8` is two to three times as fast.) Augmentation takes batches. Everything runs
   under `jax.jit`; NumPy arrays are accepted. `key` comes first, options are keyword-only.
 - Images are HWC, uint8 at rest, float32 in [0, 1] in arithmetic; an op keeps the dtype it is given.
 - Camera axes are OpenCV's (x right, y down, z forward), `cam_to_world` is the camera's pose. The
