@@ -14,8 +14,8 @@ NOISE = 0.004
 """Default standard deviation (metres) of the disturbance of each commanded translation."""
 
 _CORRELATION = 0.8  # of the disturbance from one control step to the next: it pushes, not trembles
-# Of the disturbance once the gripper closes: a lift should stay straight, and rises 4 mm a step,
-# as much as the disturbance of an open hand.
+# Share of the disturbance that is left once the gripper closes. A lift rises 4 mm a step, no more
+# than the whole disturbance: with that it would neither rise steadily nor straight.
 _HELD_SHARE = 0.3
 _YAW_NOISE = 4.0  # radians of disturbance per metre: 4 mm go with about 1 degree
 

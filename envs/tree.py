@@ -141,6 +141,7 @@ def _turned(matrix: jax.Array, vector: jax.Array) -> jax.Array:
 
 
 def _unit(quat: jax.Array) -> jax.Array:
+    # Zeros, as they are in a state that was never set, stay zeros.
     return quat / jnp.sqrt(jnp.maximum(jnp.sum(quat * quat, -1, keepdims=True), 1e-30))
 
 
@@ -173,7 +174,7 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         quat, matrix = _quat_mul(quat[up], quat), _times(matrix[up], matrix)
     owner = np.asarray(model.jnt_bodyid)
     is_free = np.isin(owner, tree.free)[:, None]
-    at_rest = model.jnt_pos - jnp.where(tree.slide, shift, 0.0)[owner, None] * model.jnt_axis
+    at_rest = model.jnt_pos - shift[owner, None] * model.jnt_axis
     placed = data.replace(
         qpos=_with_unit_quaternions(tree, data.qpos, free_quat),
         xanchor=pos[owner] + _turned(matrix[owner], at_rest),
@@ -304,6 +305,7 @@ def _masked_sum(mask: np.ndarray, values: jax.Array) -> jax.Array:
 
 
 def _cross(first: jax.Array, second: jax.Array) -> jax.Array:
+    """Cross product [..., 3], written out like the sums above."""
     x, y, z = (first[..., i] for i in range(3))
     a, b, c = (second[..., i] for i in range(3))
     return jnp.stack([y * c - z * b, z * a - x * c, x * b - y * a], -1)

@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from palm_jax.align import AlignSpec, Camera, align_window, encode_delta, resize
+from palm_jax.align import AlignSpec, Camera, align_window, apply_delta, encode_delta, resize
+from palm_jax.envs import control
 from palm_jax.envs.rollout import Runner, take_params
 from palm_jax.train import demos as demonstrations
 from palm_jax.train.learner import Batch
@@ -109,29 +110,21 @@ def _flipped(
     *,
     spec: AlignSpec,
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, Camera]:
-    """Image, proprioception, TCP pose, action and camera in the mirror."""
+    """Image [size, size, 3], proprioception [P], TCP pose [4, 4], action [10] and camera in the
+    mirror."""
     pose = jnp.asarray(camera.cam_to_world)
-    seen = _inverse(pose) @ tcp
+    seen = control.inverse(pose) @ tcp
     mirror = pose @ (_ACROSS @ seen @ _OPENING)
     K = jnp.asarray(camera.K)
     other = dataclasses.replace(camera, K=K.at[0, 2].set(camera.width - K[0, 2]))
     aligned = align_window(image[:, ::-1], other, jnp.zeros(2, jnp.int32), mirror, opening, spec)
     delta = jnp.concatenate(
-        [encode_delta(jnp.eye(4), _OPENING @ _delta_matrix(action) @ _OPENING), action[9:]]
+        [
+            encode_delta(jnp.eye(4), _OPENING @ apply_delta(jnp.eye(4), action[:9]) @ _OPENING),
+            action[9:],
+        ]
     )
     return aligned.image, aligned.proprio, mirror, delta, other
-
-
-def _inverse(pose: jax.Array) -> jax.Array:
-    rotation = pose[:3, :3].T
-    return jnp.eye(4).at[:3, :3].set(rotation).at[:3, 3].set(-rotation @ pose[:3, 3])
-
-
-def _delta_matrix(action: jax.Array) -> jax.Array:
-    """[4, 4] of the first nine numbers of an action, whose columns are orthonormal."""
-    first, second = action[:3], action[3:6]
-    rotation = jnp.stack([first, second, jnp.cross(first, second)], -1)
-    return jnp.eye(4).at[:3, :3].set(rotation).at[:3, 3].set(action[6:9])
 
 
 # -- RoVi-Aug: every demonstration once more, from another place -----------------------------------
@@ -231,6 +224,7 @@ def rerendered(key: jax.Array, source: Source, camera_to_world: np.ndarray) -> n
 
 
 def _degraded(key: jax.Array, image: jax.Array) -> jax.Array:
+    """uint8 [size, size, 3] as a reconstruction might have it."""
     size = image.shape[0]
     small = resize(image.astype(jnp.float32) / 255, max(size // _DETAIL, 1))
     noisy = small + _NOISE * jax.random.normal(key, small.shape)

@@ -12,10 +12,13 @@ from jax.typing import ArrayLike
 
 from palm_jax._checks import OptionError, ShapeError, as_image
 
+GRID = 32.0
+"""Pixels of a camera's image between two lines of the grid."""
+
 _LINE = 96 / 255  # grey of the lines
 
 
-def isolate(image: ArrayLike, mask: ArrayLike, *, pitch: float = 32.0) -> jax.Array:
+def isolate(image: ArrayLike, mask: ArrayLike, *, pitch: float = GRID) -> jax.Array:
     """Keep the masked pixels, put a black grid behind them (the input of ARRO).
 
     Args:

@@ -31,11 +31,8 @@ from palm_jax.align import camera as cam
 from palm_jax.align import crop as cropping
 from palm_jax.align import overlay as drawing
 from palm_jax.align import pixels
-from palm_jax.align.isolate import isolate
+from palm_jax.align.isolate import GRID, isolate
 from palm_jax.align.proprio import LAYOUTS, _proprio
-
-GRID = 32.0
-"""Pixels of the camera image between two lines of the grid behind isolated things."""
 
 
 @jax.tree_util.register_static
@@ -173,7 +170,7 @@ def _align(
 ) -> Aligned:
     uv, valid = _seen(camera, tcp)
     if mask is not None:
-        image = isolate(image, mask, pitch=GRID)
+        image = isolate(image, mask)
     rows, columns = jnp.arange(camera.height), jnp.arange(camera.width)
     if spec.crop is not None:
         # The window is cut before drawing, so that only its pixels are touched. Strokes depend on
