@@ -178,13 +178,12 @@ def _align_like(
 ) -> tuple[Aligned, jax.Array]:
     reference = dataclasses.replace(reference, cam_to_world=camera.cam_to_world)
     if rendered:
-        view, side, window_spec = spec.view_camera(reference), spec.size, spec
+        view, window_spec = spec.view_camera(reference), spec
     else:
         # The window in the reference's own pixels: `align` resizes it.
-        view, side = reference, spec.crop
-        window_spec = spec if side is None else dataclasses.replace(spec, size=side)
+        view, window_spec = reference, dataclasses.replace(spec, size=spec.crop or spec.size)
     origin, _ = window_origin(view, tcp, window_spec)
-    height, width = (view.height, view.width) if side is None else (side, side)
+    height, width = (view.height, view.width) if spec.crop is None else (window_spec.size,) * 2
     window = view.cropped(origin[::-1].astype(jnp.float32), height, width)
     pixels, real = _reframe(image, camera, window)
     if spec.border == "constant" and not rendered:
