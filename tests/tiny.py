@@ -44,7 +44,7 @@ def state(method: str, seed: int) -> TrainState:
     return dataclasses.replace(
         first,
         step=jnp.asarray(seed, jnp.int32),
-        ema_params=jax.tree.map(lambda leaf: 0.9 * leaf + 0.01, first.params),
+        ema_params=jax.tree.map(lambda leaf: 0.9 * leaf, first.params),
     )
 
 

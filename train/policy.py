@@ -216,6 +216,7 @@ class Policy:
 
     Attributes:
       contract: what it was trained with.
+      state: its parameters and normalisation.
       zoom: see `load`.
     """
 
@@ -231,7 +232,7 @@ class Policy:
     ) -> None:
         """See `load`, which checks what is given here."""
         self.contract, self.zoom = contract, zoom
-        self._learner, self._state, self._off_centre = learner, state, off_centre
+        self._learner, self.state, self._off_centre = learner, state, off_centre
         self._noise = None if noise_seed is None else jax.random.key(noise_seed)
         self._step = 0
         self._sizes: set[tuple[int, int]] = set()
@@ -309,7 +310,7 @@ class Policy:
         seen = self._checked(image, K, cam_to_world, tcp, opening, mask)
         compiled = self._compiled_for(seen.image.shape[:2])
         key = None if self._noise is None else jax.random.fold_in(self._noise, self._step)
-        found = self._decide(self._state, key, *seen)
+        found = self._decide(self.state, key, *seen)
         target, action, valid, coverage = (np.asarray(value) for value in found)
         _require_in_view(bool(valid), seen)
         if not (np.isfinite(target).all() and np.isfinite(action).all()):
@@ -351,7 +352,7 @@ class Policy:
         for _ in range(4):
             start = time.perf_counter()
             key = None if self._noise is None else jax.random.fold_in(self._noise, 0)
-            jax.block_until_ready(self._decide(self._state, key, *sample))
+            jax.block_until_ready(self._decide(self.state, key, *sample))
             seconds.append(time.perf_counter() - start)
         return 1e3 * min(seconds[1:])
 
@@ -564,7 +565,7 @@ def _opening(opening: ArrayLike) -> NDArray[np.float32]:
 def load(
     run: str | Path,
     *,
-    image_size: tuple[int, int] = IMAGE_SIZE,
+    image_size: tuple[int, int] | None = IMAGE_SIZE,
     zoom: float = 1.0,
     off_centre: float = _OFF_CENTRE,
     noise_seed: int | None = None,
@@ -574,7 +575,8 @@ def load(
 
     Args:
       run: folder of one run (with several methods, each has its own).
-      image_size: rows and columns of the images to come; the policy is compiled for them here.
+      image_size: rows and columns of the images to come; the policy is compiled for them here. None
+        leaves that to the first call.
       zoom: how much larger the policy is to be shown the scene than equal angles make it. 1 is
         right for a camera about as far away as the training's (`contract.distance`); at another
         distance, its ratio to that makes objects as large as in training: 0.5 at half of it.
@@ -592,7 +594,7 @@ def load(
         raise PolicyError(f"zoom: expected a positive number, got {zoom}")
     if not off_centre >= 0:
         raise PolicyError(f"off_centre: expected a share of the image, got {off_centre}")
-    if min(image_size) < 1:
+    if image_size is not None and min(image_size) < 1:
         raise PolicyError(f"image_size: expected rows and columns, got {image_size}")
     _check_one_run(folder)
     try:
@@ -611,8 +613,9 @@ def load(
     policy = Policy(
         learner, state, contract, zoom=zoom, off_centre=off_centre, noise_seed=noise_seed
     )
-    took = policy.warm_up(*image_size)
-    _log.info("%s: %.1f ms an action for images of %d x %d", folder, took, *image_size)
+    if image_size is not None:
+        took = policy.warm_up(*image_size)
+        _log.info("%s: %.1f ms an action for images of %d x %d", folder, took, *image_size)
     return policy
 
 

@@ -61,8 +61,8 @@ def isolated() -> Policy:
 def test_the_average_of_the_best_checkpoint_acts(policy: Policy) -> None:
     """Not the newest, not the last parameters: what the run's own evaluation uses."""
     expected = tiny.state("palm", 10)
-    jax.tree.map(np.testing.assert_array_equal, policy._state.params, expected.ema_params)
-    jax.tree.map(np.testing.assert_array_equal, policy._state.normalizer, expected.normalizer)
+    jax.tree.map(np.testing.assert_array_equal, policy.state.params, expected.ema_params)
+    jax.tree.map(np.testing.assert_array_equal, policy.state.normalizer, expected.normalizer)
     assert policy.contract.step == 10
 
 
@@ -170,7 +170,7 @@ def test_the_network_gets_what_is_shown(policy: Policy) -> None:
     """`see` is what acts: the learner, asked directly, gives the same action."""
     seen = policy.see(**GOOD)
     assert seen.image.shape == (32, 32, 3) and isinstance(seen.image, np.ndarray)
-    learner, state = tiny.learner("palm"), policy._state
+    learner, state = tiny.learner("palm"), policy.state
     prediction, _ = learner.jitted_predict(state, {"front": seen.image[None]}, seen.proprio[None])
     low, high = (np.asarray(x) for x in jax.tree.leaves(state.normalizer.action))
     plain = low + (np.asarray(prediction)[0] + 1) / 2 * (high - low)
@@ -360,10 +360,10 @@ def test_slightly_wrong_sensors_pass(policy: Policy) -> None:
 @pytest.fixture
 def broken(policy: Policy) -> Iterator[Policy]:
     """A policy one weight of which is not a number."""
-    leaves, structure = jax.tree.flatten(policy._state.params)
+    leaves, structure = jax.tree.flatten(policy.state.params)
     leaves[-1] = leaves[-1].at[0].set(np.nan)
     params = jax.tree.unflatten(structure, leaves)
-    state = dataclasses.replace(policy._state, params=params)
+    state = dataclasses.replace(policy.state, params=params)
     yield Policy(tiny.learner("palm"), state, policy.contract)
 
 
@@ -375,7 +375,7 @@ def test_nothing_is_returned_that_is_not_finite(broken: Policy) -> None:
 def test_parameters_that_are_not_finite_are_not_loaded(tmp_path: Path, broken: Policy) -> None:
     folder = tiny.run()
     shutil.copytree(folder, tmp_path / "run")
-    state = dataclasses.replace(tiny.state("palm", 40), ema_params=broken._state.params)
+    state = dataclasses.replace(tiny.state("palm", 40), ema_params=broken.state.params)
     meta = {"score": 1.0}
     module.checkpoint.save(tmp_path / "run" / "checkpoints", 40, state, meta)
     with pytest.raises(PolicyError, match="not finite; train again"):
