@@ -9,7 +9,6 @@ camera. Prints JSON.
 import argparse
 import contextlib
 import dataclasses
-import json
 import os
 import re
 import subprocess
@@ -222,12 +221,13 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--calls", type=int, default=300)
     parser.add_argument("--worlds", type=int, default=8)
+    parser.add_argument("--json", type=Path, help="write the figures there as well")
     words = parser.parse_args()
     found: dict[str, Any] = {"load_before": [round(x, 2) for x in os.getloadavg()]}
     found["latency"] = latency(words.run, words.calls)
     found["load_between"] = [round(x, 2) for x in os.getloadavg()]
     found["cameras"] = cameras(words.run, words.worlds)
-    print(json.dumps({"machine": common.conditions(), **found}, indent=1))
+    common.publish({"conditions": common.conditions(), **found}, words.json)
 
 
 if __name__ == "__main__":

@@ -53,7 +53,7 @@ def photos() -> Photos:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["palm", "bc", "arro"])
+@pytest.mark.parametrize("name", ["palm", "palm-crop", "bc", "arro"])
 def test_policies_see_and_do_what_they_do_in_evaluations(name: str) -> None:
     """The evaluation renders the window itself; the policy cuts it out of a user's image."""
     taken, method, runner = photos(), methods.find(name), worlds.runner("lift_lid")
