@@ -16,7 +16,7 @@ import json
 import warnings
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -112,6 +112,16 @@ def domain_record(values: Mapping[str, ArrayLike], *, where: str = "record") -> 
                 f"got {array.shape}"
             )
     return DomainRecord(**arrays)
+
+
+def joined(parts: Sequence[DomainRecord]) -> DomainRecord:
+    """The episodes of several records (at least one), one after the other."""
+    return DomainRecord(
+        *(
+            np.concatenate([getattr(part, field.name) for part in parts])
+            for field in fields(DomainRecord)
+        )
+    )
 
 
 def counts(records: Mapping[str, DomainRecord]) -> dict[str, dict[str, int]]:

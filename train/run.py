@@ -189,7 +189,21 @@ def _one_method(
         key = jax.random.fold_in(jax.random.key(config.demo_seed), _TRANSFORM_KEY + index)
         batch = transform(key, source, batch)
     _train(config, evaluator, batch, folder, console)
-    _evaluate(config, evaluator, folder, console)
+    with _timed(folder, "evaluation_s"):
+        _evaluate(config, evaluator, folder, console)
+
+
+@contextmanager
+def _timed(folder: Path, what: str) -> Iterator[None]:
+    """Adds the seconds spent inside to times.json, which also counts over interruptions."""
+    start = time.monotonic()
+    try:
+        yield
+    finally:
+        path = folder / "times.json"
+        times = records.load_json(path) if path.exists() else {}
+        times[what] = round(times.get(what, 0.0) + time.monotonic() - start, 2)
+        write_json(path, times)
 
 
 def _train(
@@ -231,18 +245,19 @@ def _train(
             if score is not None:
                 log.write(step, {"in_domain_success": score})
 
-        learner.run(
-            model,
-            data,
-            seed=config.seed,
-            state=state,
-            bank=bank,
-            log_every=25,
-            on_log=on_log,
-            checkpoint_every=config.checkpoint_every,
-            on_checkpoint=on_checkpoint,
-            should_stop=stop,
-        )
+        with _timed(folder, "training_and_selection_s"):
+            learner.run(
+                model,
+                data,
+                seed=config.seed,
+                state=state,
+                bank=bank,
+                log_every=25,
+                on_log=on_log,
+                checkpoint_every=config.checkpoint_every,
+                on_checkpoint=on_checkpoint,
+                should_stop=stop,
+            )
     if stop():
         raise Interrupted
 
@@ -253,13 +268,14 @@ def _score_if_missing(
     """In-domain success of a checkpoint, written into its meta data; None if not scored."""
     if step < config.select_from * config.steps or checkpoint.SCORE in checkpoint.read_meta(path):
         return None
-    found = evaluator.domain(
-        evaluator.learner.policy_state(state),
-        "in_domain",
-        seed=_SELECTION_SEED,
-        count=config.select_scenes,
-        aligned=False,
-    )
+    with _timed(path.parents[1], "selection_s"):
+        found = evaluator.domain(
+            evaluator.learner.policy_state(state),
+            "in_domain",
+            seed=_SELECTION_SEED,
+            count=config.select_scenes,
+            aligned=False,
+        )
     score = float(found.solved.mean())
     checkpoint.update_meta(path, **{checkpoint.SCORE: score})
     return score

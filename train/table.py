@@ -8,16 +8,19 @@ once for each task. Finished cells go into one JSON file at once:
     {"header": {...}, "results": {task: {method: {seed: {domain: {"successes", "episodes",
     "nan"}}}}}, "failed": {task: {method: {seed: log}}}}
 
-The header says under which conditions; a file with another one is not touched.
+The header says under which conditions; a file with another one is not touched. The episodes one by
+one lie in an .npz file beside it, laid out like eval.npz with TASK/METHOD/SEED/DOMAIN for names.
+`--page` makes Markdown and figures of the two.
 """
 
 import dataclasses
 import datetime
 import os
+import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +31,7 @@ from palm_jax.envs.registry import TASKS
 from palm_jax.envs.shifts import DOMAINS
 from palm_jax.train import config as configuration
 from palm_jax.train import console as terminal
-from palm_jax.train import methods, records, workspace
+from palm_jax.train import methods, records, table_page, workspace
 from palm_jax.train.config import Config, ConfigError
 from palm_jax.train.metrics import plain, write_json
 
@@ -60,6 +63,7 @@ class TableConfig:
       shard: "i/n", the i-th of n machines (from 1): it takes every n-th cell. Each has its own
         folder and file; `--merge` joins the files.
       merge: files of other shards whose results are taken over; nothing is run.
+      page: a Markdown file that the results are written into; nothing is run.
     """
 
     preset: str = "cpu"
@@ -70,6 +74,7 @@ class TableConfig:
     json: Path | None = None
     shard: str = "1/1"
     merge: tuple[Path, ...] = ()
+    page: Path | None = None
 
     @property
     def folder(self) -> Path:
@@ -230,10 +235,8 @@ def run(config: TableConfig, console: Console) -> Path:
     """
     asked, fresh = cells(config), header(config)
     table = read(config.file, fresh)
-    for path in config.merge:
-        _merge(table, path, fresh)
     if config.merge:
-        write_json(config.file, table)
+        _merge_all(config, table, fresh)
         return config.file
     missing = [cell for cell in asked if _get(table, "results", cell) is None]
     console.print(f"{len(asked)} cells, {len(asked) - len(missing)} done, into {config.file}")
@@ -243,17 +246,48 @@ def run(config: TableConfig, console: Console) -> Path:
         start = time.monotonic()
         log = config.folder / f"{cell.name}.log"
         code = _train(cell_config(config, cell), log)
-        counts = config.folder / cell.name / "eval.json"
         table = read(config.file, fresh)  # another shard may write beside us
-        if code == 0 and counts.exists():
-            _put(table, "results", cell, records.load_counts(counts))
-            _drop(table, "failed", cell)
+        if code == 0 and (config.folder / cell.name / "eval.json").exists():
+            _take(table, config, cell)
             took.append(time.monotonic() - start)
         else:
             _put(table, "failed", cell, str(log))
             console.print(f"{cell.name} failed (exit code {code}): see {log}", style="bold red")
+        _note_origin(table["header"], fresh)
         write_json(config.file, table)
     return config.file
+
+
+def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
+    """What a finished cell left in its folder, into the table and the file beside it."""
+    folder = config.folder / cell.name
+    _keep_episodes(config.file, {cell: records.load_eval(folder / "eval.npz")})
+    _put(table, "results", cell, records.load_counts(folder / "eval.json"))
+    _drop(table, "failed", cell)
+    if (folder / "times.json").exists():
+        _put(table, "times", cell, records.load_json(folder / "times.json"))
+    _note_speed(table)
+
+
+def _note_speed(table: dict[str, Any]) -> None:
+    """Medians over the cells, into the header: samples a second, seconds of an evaluation."""
+    times = [t for cell in _cells_of(table, "times") if (t := _get(table, "times", cell))]
+    recipe, header = table["header"]["recipe"], table["header"]
+    samples = recipe["steps"] * recipe["batch_size"]
+    training = [t["training_and_selection_s"] - t.get("selection_s", 0.0) for t in times]
+    if training:
+        header["samples_per_second"] = round(samples / statistics.median(training), 1)
+        header["evaluation_seconds"] = statistics.median(t["evaluation_s"] for t in times)
+
+
+def _keep_episodes(table: Path, fresh: Mapping[Cell, Mapping[str, records.DomainRecord]]) -> None:
+    """Adds the episodes of cells to those beside the table."""
+    path = table_page.episodes_file(table)
+    kept = records.load_eval(path) if path.exists() else {}
+    for cell, by_domain in fresh.items():
+        for domain, record in by_domain.items():
+            kept[f"{cell.task}/{cell.method}/{cell.seed}/{domain}"] = record
+    records.save_eval(path, kept)
 
 
 def _announce(console: Console, cell: Cell, left: int, took: list[float]) -> None:
@@ -299,15 +333,40 @@ def _environment(folder: Path) -> dict[str, str]:
     return {**ours, **os.environ}
 
 
-def _merge(table: dict[str, Any], path: Path, fresh: dict[str, Any]) -> None:
-    other = read(path, fresh)
-    for part in ("results", "failed"):
-        for cell in _cells_of(other, part):
-            if _get(table, "results", cell) is None:
-                _put(table, part, cell, _get(other, part, cell))
+def _merge(table: dict[str, Any], path: Path, fresh: dict[str, Any]) -> list[Cell]:
+    """Takes over what only the other file has; returns the cells that came with results."""
+    other, taken = read(path, fresh), []
+    for cell in _cells_of(other, "results"):
+        if _get(table, "results", cell) is None:
+            _put(table, "results", cell, _get(other, "results", cell))
+            _put(table, "times", cell, _get(other, "times", cell) or {})
+            _drop(table, "failed", cell)
+            taken.append(cell)
+    for cell in _cells_of(other, "failed"):
+        if _get(table, "results", cell) is None:
+            _put(table, "failed", cell, _get(other, "failed", cell))
+    _note_origin(table["header"], other["header"])
+    return taken
+
+
+def _note_origin(header: dict[str, Any], other: dict[str, Any]) -> None:
+    """Machines and commits that results came from, those of `other` added to `header`."""
     for name in ("machine", "commit"):
-        seen = {str(table["header"].get(name)), str(other["header"].get(name))}
-        table["header"][name] = ", ".join(sorted(seen))
+        seen = {*str(header.get(name)).split("; "), *str(other.get(name)).split("; ")}
+        header[name] = "; ".join(sorted(seen))
+
+
+def _merge_all(config: TableConfig, table: dict[str, Any], fresh: dict[str, Any]) -> None:
+    for path in config.merge:
+        taken = _merge(table, path, fresh)
+        episodes: dict[Cell, dict[str, records.DomainRecord]] = {}
+        beside = table_page.episodes_file(path)
+        for name, record in (records.load_eval(beside) if beside.exists() else {}).items():
+            task, method, seed, domain = name.split("/")
+            episodes.setdefault(Cell(task, method, int(seed)), {})[domain] = record
+        _keep_episodes(config.file, {cell: episodes[cell] for cell in taken if cell in episodes})
+    _note_speed(table)
+    write_json(config.file, table)
 
 
 def _cells_of(table: dict[str, Any], part: str) -> Iterator[Cell]:
@@ -322,6 +381,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     config = tyro.cli(TableConfig, args=argv, prog="python -m palm_jax table")
     console = terminal.make_console()
     try:
+        if config.page is not None:
+            written = table_page.write(config.file, config.page)
+            console.print(f"Written: {', '.join(map(str, written))}", highlight=False)
+            return 0
         path = run(config, console)
     except (ConfigError, records.RecordError) as error:
         print(f"error: {error}", file=sys.stderr)

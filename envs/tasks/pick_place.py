@@ -131,7 +131,10 @@ class PickPlaceTask(Task):
 
     def contacts(self, robot: Robot) -> tuple[Contact, ...]:
         grasped = tuple(item.grasp_geom for item in self.items)
-        rests = [Contact(*pair, OBJECT_FRICTION, stiff=True) for pair in self.supports]
+        rests = [
+            Contact(*pair, 0.1 if "edge" in pair[1] else OBJECT_FRICTION, stiff=True)
+            for pair in self.supports
+        ]
         tips = tip_contacts(robot, (*grasped, *self.tip_obstacles))
         return (*pad_contacts(robot, grasped), *rests, *tips)
 

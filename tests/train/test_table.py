@@ -4,10 +4,11 @@ import dataclasses
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from palm_jax.train import config as configuration
-from palm_jax.train import table
+from palm_jax.train import records, table, table_page
 from palm_jax.train.config import Config, ConfigError
 from palm_jax.train.table import TableConfig
 
@@ -36,6 +37,13 @@ class Trainer:
         config.out.mkdir(parents=True, exist_ok=True)
         count = {"successes": len(self.asked), "episodes": 24, "nan": 0}
         (config.out / "eval.json").write_text(json.dumps({"in_domain": count}))
+        episodes = {
+            "success": np.arange(24) < len(self.asked), "nan": np.zeros(24, bool),
+            "object_xy": np.zeros((24, 2)), "camera_angle": np.zeros(24), "length": np.ones(24),
+        }  # fmt: skip
+        records.save_eval(config.out / "eval.npz", {"in_domain": episodes})
+        took = {"training_and_selection_s": 30.0, "selection_s": 6.0, "evaluation_s": 10.0}
+        (config.out / "times.json").write_text(json.dumps(took))
         return 0
 
 
@@ -153,9 +161,22 @@ def test_shards_are_merged(tmp_path: Path, trainer: Trainer) -> None:
     )
     assert run(whole) == 0
     found = json.loads(whole.file.read_text())["results"]
-    assert {(t, m) for t, row in found.items() for m in row} == {
-        (task, method) for task in SMALL.tasks for method in SMALL.methods
-    }
+    every = {(task, method) for task in SMALL.tasks for method in SMALL.methods}
+    assert {(t, m) for t, row in found.items() for m in row} == every
+    # Episode by episode, too: each policy's are its own.
+    episodes = records.load_eval(table_page.episodes_file(whole.file))
+    assert len(episodes) == len(every)
+    for task, method in every:
+        counted = found[task][method]["0"]["in_domain"]["successes"]
+        assert episodes[f"{task}/{method}/0/in_domain"].success.sum() == counted
+
+
+def test_the_header_tells_the_speed(tmp_path: Path, trainer: Trainer) -> None:
+    config = dataclasses.replace(SMALL, out=tmp_path, seeds=(0,), methods=("palm",))
+    assert run(config) == 0
+    header = json.loads(config.file.read_text())["header"]
+    assert header["samples_per_second"] == 2400 * 32 / (30.0 - 6.0)
+    assert header["evaluation_seconds"] == 10.0
 
 
 @pytest.mark.parametrize(
