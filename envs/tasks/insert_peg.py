@@ -29,6 +29,7 @@ _RING = Item(
     placed_radius=0.012,
     placed_height=0.05,
     placed_upright=0.9,
+    close_height=0.005,  # the ring is 10 mm high
 )
 _EDGES = tuple(f"peg_edge{i}" for i in range(4))
 _BARS = tuple(f"ring_rail{i}" for i in range(4))

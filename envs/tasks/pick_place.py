@@ -19,7 +19,7 @@ from palm_jax.envs.control import yaw_quaternion
 from palm_jax.envs.robots import Robot
 from palm_jax.envs.tasks.base import TABLE_HEIGHT, Command, Placement, Stage, Task
 from palm_jax.envs.tasks.fingers import OBJECT_FRICTION, pad_contacts, tip_contacts
-from palm_jax.envs.tasks.skills import Hold, both_touch, hold, pick, put, turn_to
+from palm_jax.envs.tasks.skills import CLOSE_HEIGHT, Hold, both_touch, hold, pick, put, turn_to
 from palm_jax.envs.world import Contact
 
 _PICKED = 0.03  # metres that a held object has risen when the global policy takes over
@@ -51,6 +51,7 @@ class Item:
         place...
       placed_height: ...if its origin is at most this high above the table...
       placed_upright: ...and the cosine of its tilt at least this (-1: however it lies).
+      close_height: height of the TCP above the grasp (metres) at which the expert closes the hand.
     """
 
     body: str
@@ -71,6 +72,7 @@ class Item:
     placed_radius: float
     placed_height: float
     placed_upright: float = -1.0
+    close_height: float = CLOSE_HEIGHT
 
 
 def stages_of(items: Sequence[Item]) -> tuple[Stage, ...]:
@@ -285,6 +287,7 @@ class PickPlaceTask(Task):
             hold=found.hold,
             bottom=rest + (grasp[2] - data.xpos[found.body, 2]),
             rise=2 * _PICKED,
+            close_height=item.close_height,
         )
 
     def _put(

@@ -82,5 +82,3 @@ def test_seeds_are_summed() -> None:
     total = claims.summed({"0": one, "1": two})
     assert total == {"in_domain": {"successes": 7, "episodes": 20, "nan": 1}}
     assert one["in_domain"]["successes"] == 3
-
-

@@ -57,7 +57,9 @@ def page(made: Path) -> str:
 
 
 def test_what_is_around_stays(page: str) -> None:
-    assert page.startswith("# Before\n") and page.endswith("\nAfter.\n") and "stale words" not in page
+    assert (
+        page.startswith("# Before\n") and page.endswith("\nAfter.\n") and "stale words" not in page
+    )
 
 
 def test_every_policy_has_its_counts(page: str, made: Path) -> None:
