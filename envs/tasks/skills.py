@@ -12,8 +12,8 @@ from palm_jax.envs.robots import Robot
 from palm_jax.envs.tasks.base import Command
 
 # The gripper closes within this of the grasp, or lower if the object asks for it. The funnel below
-# makes the height tell when that is: what a policy must see at a glance, it learns; a conjunction of
-# millimetres it would wait for.
+# makes the height tell when that is: what a policy must see at a glance, it learns; a conjunction
+# of millimetres it would wait for.
 CLOSE_HEIGHT = 0.011
 _CLOSE_RADIUS = 0.013
 _CLOSE_ANGLE = 0.25
