@@ -18,7 +18,7 @@ from mujoco import mjx
 from palm_jax.envs.control import yaw_quaternion
 from palm_jax.envs.robots import Robot
 from palm_jax.envs.tasks.base import TABLE_HEIGHT, Command, Placement, Stage, Task
-from palm_jax.envs.tasks.fingers import OBJECT_FRICTION, pad_contacts, tip_contacts
+from palm_jax.envs.tasks.fingers import pad_contacts, tip_contacts
 from palm_jax.envs.tasks.skills import CLOSE_HEIGHT, Hold, both_touch, hold, pick, put, turn_to
 from palm_jax.envs.world import Contact
 
@@ -116,7 +116,7 @@ class PickPlaceTask(Task):
       shuffled: whether all but the first change places at random.
       jitter: metres, per axis, by which each is moved.
       spins: which of the mocap bodies are turned at random about z.
-      supports: (geom, geom) pairs that objects rest on or bump into.
+      supports: what objects rest on or bump into.
       tip_obstacles: geoms besides the table and the items that the finger tips may push on.
       release: whether the hand must have let go of everything for success.
     """
@@ -127,18 +127,14 @@ class PickPlaceTask(Task):
     shuffled: bool
     jitter: float
     spins: tuple[bool, ...]
-    supports: tuple[tuple[str, str], ...]
+    supports: tuple[Contact, ...]
     tip_obstacles: tuple[str, ...]
     release: bool
 
     def contacts(self, robot: Robot) -> tuple[Contact, ...]:
         grasped = tuple(item.grasp_geom for item in self.items)
-        rests = [
-            Contact(*pair, 0.1 if "edge" in pair[1] else OBJECT_FRICTION, stiff=True)
-            for pair in self.supports
-        ]
         tips = tip_contacts(robot, (*grasped, *self.tip_obstacles))
-        return (*pad_contacts(robot, grasped), *rests, *tips)
+        return (*pad_contacts(robot, grasped), *self.supports, *tips)
 
     def bind(self, model: mujoco.MjModel, robot: Robot) -> PickPlaceIds:
         left, right = (model.geom(name).id for name in robot.pads)
