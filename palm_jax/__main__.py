@@ -28,6 +28,7 @@ VERBS: dict[str, Verb] = {
     "table": Verb("palm_jax.train.table", "every cell of the paper's main table, resumable"),
     "report": Verb("palm_jax.train.report", "one self-contained HTML page from run folders"),
     "show": Verb("palm_jax.train.show", "pictures of every task, robot and shift, as PNG"),
+    "debug": Verb("palm_jax.train.debug", "repeat and explain an update that failed"),
     "bench": Verb("benchmarks.__main__", "speed, side by side with peers (needs a checkout)"),
 }
 

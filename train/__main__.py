@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (configuration.ConfigError, DemoFileError, StartPoseError, RecordError, Busy) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except (NonFiniteError, OSError) as error:
+    except (NonFiniteError, MemoryError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -96,7 +96,8 @@ def _describe(leaf: Any) -> dict[str, Any]:
     return {"dtype": str(leaf.dtype), "shape": [int(n) for n in leaf.shape]}
 
 
-def _nested(named: Mapping[str, Any]) -> dict[str, Any]:
+def nested(named: Mapping[str, Any]) -> dict[str, Any]:
+    """The tree of dictionaries in which leaves have these names."""
     tree: dict[str, Any] = {}
     for name, leaf in named.items():
         *folders, last = name.split("/")
@@ -171,7 +172,7 @@ def save(
 def _write_arrays(path: Path, named: Mapping[str, Any]) -> None:
     host = {name: np.asarray(leaf) for name, leaf in named.items()}
     # Orbax refuses arrays without elements; the manifest's shape and dtype say all about them.
-    ocp.save(path, _nested({name: array for name, array in host.items() if array.size}))
+    ocp.save(path, nested({name: array for name, array in host.items() if array.size}))
 
 
 def _hash_files(folder: Path) -> dict[str, dict[str, Any]]:

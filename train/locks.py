@@ -105,11 +105,12 @@ class _Owner:
 
 
 @contextlib.contextmanager
-def claim(folder: str | Path, *, take_over: bool = False) -> Iterator[None]:
+def claim(folder: str | Path, *, name: str = CLAIM, take_over: bool = False) -> Iterator[None]:
     """Holds the claim on a folder (made if absent).
 
     Args:
       folder: of a run or a cell.
+      name: of the file; another one claims less than the whole folder.
       take_over: also from another machine, whose processes cannot be seen from here.
 
     Raises:
@@ -117,12 +118,12 @@ def claim(folder: str | Path, *, take_over: bool = False) -> Iterator[None]:
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    path, own = folder / CLAIM, Process.own()
+    path, own = folder / name, Process.own()
     with locked(path):
         found = _Owner.read(path)
         shared = found is not None and _is_parent(found)
         if found is not None and not shared:
-            _refuse_if_alive(folder, found, take_over=take_over)
+            _refuse_if_alive(path, found, take_over=take_over)
         processes = (*found.processes, own) if found is not None and shared else (own,)
         since = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
         _write(path, _Owner(host(), processes, since))
@@ -144,20 +145,20 @@ def _is_parent(owner: _Owner) -> bool:
     return owner.host == host() and Process(parent, _started(parent)) in owner.processes
 
 
-def _refuse_if_alive(folder: Path, owner: _Owner, *, take_over: bool) -> None:
+def _refuse_if_alive(path: Path, owner: _Owner, *, take_over: bool) -> None:
     pids = ", ".join(str(process.pid) for process in owner.processes)
     name = owner.host.partition(" ")[0]
     if owner.host != host():
         if take_over:
             return
         raise Busy(
-            f"{folder} has been in use since {owner.since} by process {pids} on {name}, which "
-            f"cannot be seen from here: if it is gone, delete {folder / CLAIM}",
+            f"{path.parent} has been in use since {owner.since} by process {pids} on {name}, "
+            f"which cannot be seen from here: if it is gone, delete {path}",
             elsewhere=True,
         )
     if any(process.alive for process in owner.processes):
         raise Busy(
-            f"{folder} has been in use since {owner.since} by process {pids} on this machine: "
+            f"{path.parent} has been in use since {owner.since} by process {pids} on this machine: "
             "wait for it, stop it, or choose another folder"
         )
 

@@ -61,6 +61,7 @@ class Sweep:
     ys: NDArray[np.float64]  # [Y] metres, cell centres
     success: NDArray[np.bool_]  # [A, X, Y, S]
     nan: NDArray[np.bool_]  # [A, X, Y, S]
+    worlds: int = 0  # in a batch at the end; 0: not recorded
 
     @property
     def solved(self) -> NDArray[np.bool_]:
@@ -76,6 +77,7 @@ class StrengthSweep:
     strengths: NDArray[np.float64]  # [K]
     success: NDArray[np.bool_]  # [K, S]
     nan: NDArray[np.bool_]  # [K, S]
+    worlds: int = 0  # in a batch at the end; 0: not recorded
 
     @property
     def solved(self) -> NDArray[np.bool_]:
@@ -202,7 +204,12 @@ def load_strengths(path: Path) -> StrengthSweep:
             f"{path}: expected success and nan of shape [{len(strengths)}, S], "
             f"got {success.shape} and {nan.shape}"
         )
-    return StrengthSweep(str(arrays["shift"]), strengths, success, nan)
+    return StrengthSweep(str(arrays["shift"]), strengths, success, nan, _worlds(arrays))
+
+
+def _worlds(arrays: Mapping[str, NDArray[Any]]) -> int:
+    found = arrays.get("worlds", np.zeros((), int))
+    return int(found) if found.shape == () and found.dtype.kind in "iu" else 0
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -244,7 +251,7 @@ def load_sweep(path: Path) -> Sweep:
                 f"{path}: {name}: expected shape [angles, xs, ys, episodes] = {grid} + (S,), "
                 f"got {array.shape}"
             )
-    return Sweep(angles, xs, ys, success, nan)
+    return Sweep(angles, xs, ys, success, nan, _worlds(arrays))
 
 
 def load_json(path: Path) -> dict[str, Any]:

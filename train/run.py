@@ -17,6 +17,7 @@ from palm_jax.envs import physics, shifts
 from palm_jax.envs.rollout import Runner
 from palm_jax.train import (
     checkpoint,
+    debug,
     demos,
     figures,
     films,
@@ -82,7 +83,13 @@ def _execute(config: Config, out: Path, console: Console) -> Path:
             "folder": out,
         },
     )
-    runners = Runners.of(config.task, config.robot, config.second_robot, _worlds(config))
+    runners = Runners.of(
+        config.task,
+        config.robot,
+        config.second_robot,
+        _worlds(config),
+        tell=lambda text: console.print(text, style="bold", markup=False),
+    )
     # One for each method throughout: what it has compiled, it keeps.
     evaluators = {
         name: workspace.make_evaluator(config, methods.find(name), runners) for name in folders
@@ -91,7 +98,7 @@ def _execute(config: Config, out: Path, console: Console) -> Path:
     for name, folder in folders.items():
         began = time.monotonic()
         _one_method(config, evaluators[name], data, folder, console)
-        _note_environment(config, folder, time.monotonic() - began)
+        _note_environment(config, folder, time.monotonic() - began, runners.worlds)
     if config.sweep:
         _sweeps(evaluators, folders, console)
     _gallery(folders, out, console)
@@ -118,10 +125,13 @@ def _worlds(config: Config) -> int:
     return config.scenes if config.scenes <= limit else limit // 2
 
 
-def _note_environment(config: Config, folder: Path, wall_s: float) -> None:
+def _note_environment(
+    config: Config, folder: Path, wall_s: float, worlds: Mapping[str, int]
+) -> None:
     path = folder / "env.json"
     earlier = _noted(path).get("wall_s", 0.0)
-    write_json(path, workspace.environment(config, wall_s=earlier + wall_s))
+    found = workspace.environment(config, wall_s=earlier + wall_s)
+    write_json(path, {**found, "worlds": dict(worlds)})
 
 
 def _noted(path: Path) -> dict[str, Any]:
@@ -242,6 +252,7 @@ def _train(
             terminal.resumed(console, f"{evaluator.method.name}, step {done} of {config.steps}")
         _score_if_missing(config, evaluator, path, done, state)
     bank = _backgrounds(config) if evaluator.method.augment else None
+    dumped = debug.dumping(folder / debug.DUMPS, model)
     stop = interrupts.Stop("Stopping after this update, which saves; once more ends at once.")
     with (
         MetricsLog(folder / "metrics.jsonl", resume_step=done) as log,
@@ -271,7 +282,7 @@ def _train(
             if score is not None:
                 log.write(step, {"in_domain_success": score})
 
-        with _timed(folder, "training_and_selection_s"):
+        with _timed(folder, "training_and_selection_s"), dumped as on_failure:
             learner.run(
                 model,
                 data,
@@ -283,6 +294,7 @@ def _train(
                 checkpoint_every=config.checkpoint_every,
                 on_checkpoint=on_checkpoint,
                 should_stop=stop,
+                on_failure=on_failure,
             )
     if stop():
         raise Interrupted
@@ -408,14 +420,14 @@ def _sweeps(evaluators: dict[str, Evaluator], folders: dict[str, Path], console:
             continue
         evaluator = evaluators[name]
         with terminal.ProgressBar(console, job.episodes, f"sweep {name}", unit="episode") as bar:
-            found = job.run(
+            job.perform(
+                path,
                 evaluator,
                 workspace.best_policy(folder, evaluator.learner),
                 seed=options.seed,
                 aligned=workspace.quoted_variant(folder) == "aligned",
                 progress=bar.advance,
             )
-        job.save(path, found)
 
 
 def _gallery(folders: dict[str, Path], out: Path, console: Console) -> None:
