@@ -18,6 +18,9 @@ _CORRELATION = 0.8  # of the disturbance from one control step to the next: it p
 # rises 4 mm a step, no more than the whole disturbance: with that it would neither rise steadily
 # nor straight; and fingers that let go would knock what they put down off its place.
 _HELD_SHARE = 0.3
+# Now and then an empty hand is knocked off its way, by twice the disturbance: a policy errs by more
+# than a steady disturbance does, and must have seen the way back from there.
+_KNOCK_CHANCE, _KNOCK = 0.05, 2.0
 _FREE_OPENING = 0.95  # of the gripper (0..1): from there on it holds nothing
 _YAW_NOISE = 4.0  # radians of disturbance per metre: 4 mm go with about 1 degree
 
@@ -104,10 +107,13 @@ class Demonstrator:
     ) -> "_Command":
         env = self.runner.env
         action = env.expert(state)
-        fresh = jax.random.normal(key, (4,)) * noise
-        push = _CORRELATION * push + jnp.sqrt(1 - _CORRELATION**2) * fresh
         opening = env.opening(state)
         free = (action[9] > 0.5) & (opening > _FREE_OPENING)
+        steady_key, knock_key, chance_key = jax.random.split(key, 3)
+        fresh = jnp.sqrt(1 - _CORRELATION**2) * jax.random.normal(steady_key, (4,))
+        knock = _KNOCK * jax.random.normal(knock_key, (4,))
+        knocked = free & (jax.random.uniform(chance_key) < _KNOCK_CHANCE)
+        push = _CORRELATION * push + noise * (fresh + jnp.where(knocked, knock, 0.0))
         scaled = jnp.where(free, 1.0, _HELD_SHARE) * push
         return _Command(action, disturbed(action, scaled), push, env.tcp(state), opening)
 
