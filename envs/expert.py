@@ -109,13 +109,19 @@ class Demonstrator:
         action = env.expert(state)
         opening = env.opening(state)
         free = (action[9] > 0.5) & (opening > _FREE_OPENING)
-        steady_key, knock_key, chance_key = jax.random.split(key, 3)
-        fresh = jnp.sqrt(1 - _CORRELATION**2) * jax.random.normal(steady_key, (4,))
-        knock = _KNOCK * jax.random.normal(knock_key, (4,))
-        knocked = free & (jax.random.uniform(chance_key) < _KNOCK_CHANCE)
-        push = _CORRELATION * push + noise * (fresh + jnp.where(knocked, knock, 0.0))
+        push = next_push(key, push, noise, free)
         scaled = jnp.where(free, 1.0, _HELD_SHARE) * push
         return _Command(action, disturbed(action, scaled), push, env.tcp(state), opening)
+
+
+def next_push(key: jax.Array, push: jax.Array, noise: jax.Array, free: jax.Array) -> jax.Array:
+    """The disturbance [4] that follows on `push` [4], of standard deviation `noise` [] (metres) and
+    larger for a hand that is `free` (bool []): that is knocked now and then."""
+    steady_key, knock_key, chance_key = jax.random.split(key, 3)
+    fresh = jnp.sqrt(1 - _CORRELATION**2) * jax.random.normal(steady_key, (4,))
+    knock = _KNOCK * jax.random.normal(knock_key, (4,))
+    knocked = free & (jax.random.uniform(chance_key) < _KNOCK_CHANCE)
+    return _CORRELATION * push + noise * (fresh + jnp.where(knocked, knock, 0.0))
 
 
 def disturbed(action: jax.Array, push: jax.Array) -> jax.Array:
