@@ -1,4 +1,4 @@
-"""The disturbance of demonstrations has the size it says. What experts do is in test_episodes.py."""
+"""The disturbance of demonstrations has the size it says. What experts do: test_episodes.py."""
 
 import jax
 import jax.numpy as jnp
@@ -15,15 +15,18 @@ def pushes() -> dict[bool, np.ndarray]:
     """[T, N, 4] by whether the hand is free, of 4 mm."""
 
     def chain(key: jax.Array, free: jax.Array) -> jax.Array:
-        def advance(push: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-            after = next_push(key, push, jnp.float32(0.004), free)
+        def advance(push: jax.Array, t: jax.Array) -> tuple[jax.Array, jax.Array]:
+            after = next_push(jax.random.fold_in(key, t), push, jnp.float32(0.004), free)
             return after, after
 
-        return jax.lax.scan(advance, jnp.zeros(4), jax.random.split(key, STEPS))[1]
+        return jax.lax.scan(advance, jnp.zeros(4), jnp.arange(STEPS))[1]
 
     run = jax.jit(jax.vmap(chain, in_axes=(0, None), out_axes=1))
-    keys = jax.random.split(jax.random.key(0), CHAINS)
-    return {free: np.asarray(run(keys, jnp.asarray(free)))[20:] for free in (False, True)}
+    made = {}
+    for free in (False, True):
+        keys = jax.random.split(jax.random.key(int(free)), CHAINS)
+        made[free] = np.asarray(run(keys, jnp.asarray(free)))[20:]
+    return made
 
 
 def test_a_steady_push_has_its_deviation_and_lasts(pushes: dict[bool, np.ndarray]) -> None:
