@@ -18,9 +18,6 @@ _CORRELATION = 0.8  # of the disturbance from one control step to the next: it p
 # rises 4 mm a step, no more than the whole disturbance: with that it would neither rise steadily
 # nor straight; and fingers that let go would knock what they put down off its place.
 _HELD_SHARE = 0.3
-# Now and then an empty hand is knocked off its way, by twice the disturbance: a policy errs by more
-# than a steady disturbance does, and must have seen the way back from there.
-_KNOCK_CHANCE, _KNOCK = 0.05, 2.0
 _FREE_OPENING = 0.95  # of the gripper (0..1): from there on it holds nothing
 _YAW_NOISE = 4.0  # radians of disturbance per metre: 4 mm go with about 1 degree
 
@@ -109,19 +106,15 @@ class Demonstrator:
         action = env.expert(state)
         opening = env.opening(state)
         free = (action[9] > 0.5) & (opening > _FREE_OPENING)
-        push = next_push(key, push, noise, free)
+        push = next_push(key, push, noise)
         scaled = jnp.where(free, 1.0, _HELD_SHARE) * push
         return _Command(action, disturbed(action, scaled), push, env.tcp(state), opening)
 
 
-def next_push(key: jax.Array, push: jax.Array, noise: jax.Array, free: jax.Array) -> jax.Array:
-    """The disturbance [4] that follows on `push` [4], of standard deviation `noise` [] (metres) and
-    larger for a hand that is `free` (bool []): that is knocked now and then."""
-    steady_key, knock_key, chance_key = jax.random.split(key, 3)
-    fresh = jnp.sqrt(1 - _CORRELATION**2) * jax.random.normal(steady_key, (4,))
-    knock = _KNOCK * jax.random.normal(knock_key, (4,))
-    knocked = free & (jax.random.uniform(chance_key) < _KNOCK_CHANCE)
-    return _CORRELATION * push + noise * (fresh + jnp.where(knocked, knock, 0.0))
+def next_push(key: jax.Array, push: jax.Array, noise: jax.Array) -> jax.Array:
+    """The disturbance [4] that follows on `push` [4], of standard deviation `noise` [] (metres)."""
+    fresh = jax.random.normal(key, (4,)) * noise
+    return _CORRELATION * push + jnp.sqrt(1 - _CORRELATION**2) * fresh
 
 
 def disturbed(action: jax.Array, push: jax.Array) -> jax.Array:
