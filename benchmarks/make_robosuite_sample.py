@@ -181,6 +181,15 @@ def record(args: argparse.Namespace) -> None:
     np.random.seed(args.seed)
     with h5py.File(args.out, "x") as file:
         data = file.create_group("data")
+        data.attrs["total"] = 0  # room for it, see below
+        data.attrs["env_args"] = json.dumps(
+            {
+                "env_name": TASKS[args.task],
+                "env_type": 1,
+                "env_version": robosuite.__version__,
+                "env_kwargs": {"robots": "Panda", "control_freq": 20 / args.every},
+            }
+        )
         for index in range(args.episodes):
             # One environment an episode: MuJoCo's renderer leaves robosuite's own context unusable.
             env = make(args.task, args.camera, args.size, 1000 * args.seed + index)
@@ -194,14 +203,6 @@ def record(args: argparse.Namespace) -> None:
             )
             env.close()
         data.attrs["total"] = sum(int(demo.attrs["num_samples"]) for demo in data.values())
-        data.attrs["env_args"] = json.dumps(
-            {
-                "env_name": TASKS[args.task],
-                "env_type": 1,
-                "env_version": robosuite.__version__,
-                "env_kwargs": {"robots": "Panda", "control_freq": 20 / args.every},
-            }
-        )
 
 
 def write(demo: h5py.Group, env: Any, rows: list, args: argparse.Namespace) -> None:

@@ -163,10 +163,15 @@ class CameraCalibration:
         width, height = turned(self.flip, self.width, self.height)
         got_height, got_width = images.shape[-3:-1]
         if (got_width, got_height) != (width, height):
+            turned_by = "; if they were turned by a quarter: --flip cw or ccw instead"
+            also = (
+                turned_by if (got_height, got_width) == (width, height) != (height, width) else ""
+            )
             raise ImageSizeError(
                 f"cameras.{self.name}: expected images of {width} x {height} pixels (width x "
                 f"height), as calibrated, got {got_width} x {got_height}; if they were resized: "
                 f"`data calibrate --from palm --file C --rescale {got_width} {got_height} --out N`"
+                f"{also}"
             )
         return FLIPS[self.flip](images)
 

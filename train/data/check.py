@@ -193,7 +193,7 @@ def sheet(recording: Recording, report: Report, spec: AlignSpec, path: Path) -> 
         whole.paste(part, (0, top))
         top += part.height
     content = io.BytesIO()
-    whole.save(content, "PNG", optimize=True)
+    whole.save(content, "PNG")
     return write_atomic(path, content.getvalue())
 
 

@@ -207,15 +207,16 @@ def _fixed_cameras(xml: str, names: Sequence[str]) -> dict[str, tuple[np.ndarray
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     present = {model.camera(i).name: i for i in range(model.ncam)}
+    standing = [name for name in present if name not in moving]
     for name in names:
         if name in moving:
             raise CalibrationError(f"camera {name!r} hangs on a joint; PALM needs one that stands")
         if name not in present:
             raise CameraNameError(
-                f"the model has no camera {name!r}; it has {', '.join(present) or 'none'}"
+                f"the model has no camera {name!r}; it has {', '.join(standing) or 'none'}"
             )
     result = {}
-    for name in names or [name for name in present if name not in moving]:
+    for name in names or standing:
         pose = np.eye(4)
         pose[:3, :3] = data.cam_xmat[present[name]].reshape(3, 3)
         pose[:3, 3] = data.cam_xpos[present[name]]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -55,8 +55,14 @@ class LeRobotSource(Source):
         return content
 
     def _table(self, path: Path, columns: list[str] | None = None, **options: Any) -> Any:
+        return self._whole(path, self._pq.read_table, columns=columns, **options)
+
+    def _names(self, path: Path) -> list[str]:
+        return list(self._whole(path, self._pq.read_schema).names)
+
+    def _whole(self, path: Path, read: Callable[..., Any], **options: Any) -> Any:
         try:
-            return self._pq.read_table(path, columns=columns, **options)
+            return read(path, **options)
         except (OSError, ValueError, RuntimeError) as error:
             raise TruncatedError(
                 f"{path}: not a whole parquet file ({error}): an interrupted copy, or a recording "
@@ -70,11 +76,7 @@ class LeRobotSource(Source):
             raise FormatError(f"{self.path}: no table in meta/episodes")
         rows = []
         for file in files:
-            try:
-                names = self._pq.read_schema(file).names
-            except (OSError, ValueError) as error:
-                raise TruncatedError(f"{file}: not a whole parquet file ({error})") from error
-            wanted = [name for name in names if not name.startswith("stats/")]
+            wanted = [name for name in self._names(file) if not name.startswith("stats/")]
             rows += self._table(file, wanted).to_pylist()
         rows.sort(key=lambda row: row["episode_index"])
         return {str(row["episode_index"]): row for row in rows}
@@ -113,15 +115,9 @@ class LeRobotSource(Source):
     def column(self, episode: str, key: str) -> Any:
         """A column of the episode's table, as pyarrow has it."""
         file = self._data_file(episode)
-        match = [("episode_index", "=", int(episode))]
-        try:
-            table = self._table(file, [key], filters=match)
-        except TruncatedError as error:
-            if "No match for FieldRef" in str(error) or "not found" in str(error):
-                raise KeyMissingError(f"{file} has no column {key!r}") from error
-            raise
-        if key not in table.column_names:
+        if key not in self._names(file):
             raise KeyMissingError(f"{file} has no column {key!r}")
+        table = self._table(file, [key], filters=[("episode_index", "=", int(episode))])
         if len(table) != self.length(episode):
             raise TruncatedError(
                 f"{file}: episode {episode} has {len(table)} rows, meta/episodes says "

@@ -31,12 +31,14 @@ from palm_jax.train.data.source import Source, open_source
 
 KNOWN_POSES = {
     "robot0_eef_pos+robot0_eef_quat": "quat_xyzw",  # robosuite
+    "palm_tcp": "matrix",  # what `data align` has written
     "tcp": "matrix",  # this package's own demonstrations
 }
 """Keys that are understood without being told -> how their orientation reads."""
 
 KNOWN_OPENINGS = {
     "robot0_gripper_qpos": (2, 0.0, 0.04),  # robosuite's Panda: metres a finger
+    "palm_opening": (1, 0.0, 1.0),  # what `data align` has written
     "opening": (1, 0.0, 1.0),  # this package's own demonstrations
     "gripper_position": (1, 1.0, 0.0),  # DROID: 0 open, 1 closed
 }
@@ -147,12 +149,12 @@ class Recording:
         assert self.keys.rotation is not None
         try:
             poses = rotations.poses(numbers, self.keys.rotation)
+        except (PoseDataError, FormatError) as error:
+            raise type(error)(f"{where}: {self.keys.pose}: {error}; {advice}") from error
+        try:
             check_pose(poses, self.keys.pose or "")
-        except (PoseDataError, PoseError) as error:
-            message = str(error) if len(str(error)) < 300 else f"{str(error)[:300]}..."
-            raise PoseDataError(f"{where}: {message}; {advice}") from error
-        except FormatError as error:
-            raise FormatError(f"{where}: {self.keys.pose}: {error}") from error
+        except PoseError:
+            raise PoseDataError(f"{where}: {_first_problem(poses)}; {advice}") from None
         return poses @ self.calibration.ee_to_tcp
 
     def _opening(self, gripper: np.ndarray) -> np.ndarray:
@@ -182,6 +184,16 @@ class Recording:
             len(names), frames, seen / frames, behind / frames, tuple(uvs), names[worst],
             shares[worst],
         )  # fmt: skip
+
+
+def _first_problem(poses: np.ndarray) -> str:
+    """What is wrong with the first of [T, 4, 4] that is no pose."""
+    for frame, pose in enumerate(poses):
+        try:
+            check_pose(pose, f"frame {frame}")
+        except PoseError as error:
+            return str(error)
+    return ""
 
 
 def open_recording(

@@ -98,6 +98,9 @@ class RobomimicWriter(output.Writer):
             args["env_kwargs"] = {"control_freq": self.source.fps}
             data.attrs["env_args"] = json.dumps(args)
         data.attrs[RECIPE] = json.dumps(recipe)
+        # Room for it now: an attribute that is added last would lie at the end of the file, and
+        # with the end of a cut copy the list of episodes would be lost.
+        data.attrs["total"] = 0
         file.flush()
         return file
 

@@ -306,13 +306,13 @@ def _copy_hdf5(
         data = file.create_group("data")
         for key, value in source.data.attrs.items():
             data.attrs[key] = value
+        data.attrs["palm_repair"] = json.dumps(note)
+        data.attrs["total"] = sum(source.length(name) for name in kept)
         numbers = {}
         for index, name in enumerate(sorted(kept, key=by_number)):
             numbers[name] = f"demo_{index}"
             source.file.copy(source.data[name], data, name=numbers[name])
             data[numbers[name]].attrs["num_samples"] = source.length(name)
-        data.attrs["total"] = sum(source.length(name) for name in kept)
-        data.attrs["palm_repair"] = json.dumps(note)
         try:
             _renamed_masks(source.file, file, numbers)
         except (OSError, RuntimeError, KeyError):

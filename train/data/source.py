@@ -143,7 +143,8 @@ class Source(abc.ABC):
             raise FormatError(f"{part!r}: expected KEY, KEY[i] or KEY[first:end]")
         name, first, end = match.groups()
         values = self.numbers(episode, self.resolve(name))
-        values = np.asarray(values, np.float64).reshape(len(values), -1)
+        values = np.asarray(values, np.float64)
+        values = values.reshape(len(values), int(np.prod(values.shape[1:])))
         if first is None:
             return values
         start, stop = int(first), int(end) if end else int(first) + 1
