@@ -34,6 +34,7 @@ VERBS: dict[str, Verb] = {
     "export": Verb(
         "palm_jax.train.export", "a policy as StableHLO, for use without Python", "export"
     ),
+    "debug": Verb("palm_jax.train.debug", "repeat and explain an update that failed"),
     "bench": Verb("benchmarks.__main__", "speed, side by side with peers (needs a checkout)"),
 }
 

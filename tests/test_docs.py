@@ -21,7 +21,7 @@ def readme_code() -> list[str]:
 
 
 def test_the_readme_example_runs() -> None:
-    code, _ = readme_code()
+    code, _, _ = readme_code()
     # A camera one metre above the table's centre that looks straight down; the hand below it.
     down = np.diag([1.0, -1.0, -1.0, 1.0])
     cam_to_world, tcp = down.copy(), down.copy()
@@ -43,7 +43,7 @@ def test_the_readme_example_runs() -> None:
 
 def test_the_readme_worlds_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """With fewer worlds: those that the other tests have compiled."""
-    _, code = readme_code()
+    _, code, _ = readme_code()
     asked = []
 
     def runner(env: Env, worlds: int) -> Runner:
@@ -57,6 +57,22 @@ def test_the_readme_worlds_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert asked == [compiled.WORLDS] and isinstance(state, State)
     assert (np.asarray(state.step) == 1).all() and state.step.shape == (compiled.WORLDS,)
     assert np.ptp(np.asarray(names["params"].light_ambient)) > 0.1  # type: ignore[attr-defined]
+
+
+def test_the_readme_policy_is_loaded_and_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a policy that only tells what it was asked; what it answers is tested elsewhere."""
+    _, _, code = readme_code()
+    asked = []
+
+    class Told:
+        def act(self, *observation: str) -> tuple[str, float]:
+            asked.append(observation)
+            return "target", 1.0
+
+    monkeypatch.setattr("palm_jax.policy.load", lambda run, image_size: Told())
+    inputs = ("image", "K", "cam_to_world", "tcp", "opening")
+    exec(compile(code, "README.md", "exec"), dict(zip(inputs, inputs, strict=True)))
+    assert asked == [inputs]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

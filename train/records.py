@@ -61,6 +61,7 @@ class Sweep:
     ys: NDArray[np.float64]  # [Y] metres, cell centres
     success: NDArray[np.bool_]  # [A, X, Y, S]
     nan: NDArray[np.bool_]  # [A, X, Y, S]
+    worlds: int = 0  # in a batch at the end; 0: not recorded
 
     @property
     def solved(self) -> NDArray[np.bool_]:
@@ -76,6 +77,7 @@ class StrengthSweep:
     strengths: NDArray[np.float64]  # [K]
     success: NDArray[np.bool_]  # [K, S]
     nan: NDArray[np.bool_]  # [K, S]
+    worlds: int = 0  # in a batch at the end; 0: not recorded
 
     @property
     def solved(self) -> NDArray[np.bool_]:
@@ -136,7 +138,8 @@ def counts(records: Mapping[str, DomainRecord]) -> dict[str, dict[str, int]]:
     }
 
 
-def _write_arrays(path: Path, arrays: Mapping[str, ArrayLike]) -> Path:
+def save_arrays(path: Path, arrays: Mapping[str, ArrayLike]) -> Path:
+    """Write an .npz file, whole or not at all."""
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, **arrays)
     return write_atomic(path, content.getvalue())
@@ -157,12 +160,12 @@ def save_eval(path: Path, records: Mapping[str, Mapping[str, ArrayLike] | Domain
             record = domain_record(values, where=domain)
         for field in fields(record):
             arrays[f"{domain}/{field.name}"] = getattr(record, field.name)
-    return _write_arrays(path, arrays)
+    return save_arrays(path, arrays)
 
 
 def save_sweep(path: Path, sweep: Sweep) -> Path:
     """Write sweep.npz, whole or not at all."""
-    return _write_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
+    return save_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
 
 
 def sweep_path(folder: Path, robot: str = "", *, shift: str = "") -> Path:
@@ -185,12 +188,12 @@ def swept_robot(path: Path) -> str:
 
 def save_strengths(path: Path, sweep: StrengthSweep) -> Path:
     """Write a `StrengthSweep`, whole or not at all."""
-    return _write_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
+    return save_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
 
 
 def load_strengths(path: Path) -> StrengthSweep:
     """Read a `StrengthSweep`."""
-    arrays = _load_arrays(path)
+    arrays = load_arrays(path)
     missing = {field.name for field in fields(StrengthSweep)} - set(arrays)
     if missing:
         raise RecordError(f"{path}: missing {', '.join(sorted(missing))}")
@@ -201,10 +204,16 @@ def load_strengths(path: Path) -> StrengthSweep:
             f"{path}: expected success and nan of shape [{len(strengths)}, S], "
             f"got {success.shape} and {nan.shape}"
         )
-    return StrengthSweep(str(arrays["shift"]), strengths, success, nan)
+    return StrengthSweep(str(arrays["shift"]), strengths, success, nan, _worlds(arrays))
 
 
-def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def _worlds(arrays: Mapping[str, NDArray[Any]]) -> int:
+    found = arrays.get("worlds", np.zeros((), int))
+    return int(found) if found.shape == () and found.dtype.kind in "iu" else 0
+
+
+def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Read an .npz file without pickles."""
     try:
         # From memory: NumPy leaves a file that it cannot read open.
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
@@ -216,7 +225,7 @@ def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
 def load_eval(path: Path) -> dict[str, DomainRecord]:
     """Read eval.npz; the domains come in the order in which they were written."""
     grouped: dict[str, dict[str, NDArray[Any]]] = {}
-    for name, array in _load_arrays(path).items():
+    for name, array in load_arrays(path).items():
         domain, _, field = name.rpartition("/")
         if not domain:
             raise RecordError(f"{path}: array {name!r} is not named domain/field")
@@ -228,7 +237,7 @@ def load_eval(path: Path) -> dict[str, DomainRecord]:
 
 def load_sweep(path: Path) -> Sweep:
     """Read sweep.npz."""
-    arrays = _load_arrays(path)
+    arrays = load_arrays(path)
     missing = {"angles", "xs", "ys", "success"} - set(arrays)
     if missing:
         raise RecordError(f"{path}: missing {', '.join(sorted(missing))}")
@@ -242,7 +251,7 @@ def load_sweep(path: Path) -> Sweep:
                 f"{path}: {name}: expected shape [angles, xs, ys, episodes] = {grid} + (S,), "
                 f"got {array.shape}"
             )
-    return Sweep(angles, xs, ys, success, nan)
+    return Sweep(angles, xs, ys, success, nan, _worlds(arrays))
 
 
 def load_json(path: Path) -> dict[str, Any]:

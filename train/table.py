@@ -31,7 +31,7 @@ from palm_jax.envs.registry import TASKS
 from palm_jax.envs.shifts import DOMAINS
 from palm_jax.train import config as configuration
 from palm_jax.train import console as terminal
-from palm_jax.train import methods, records, table_page, workspace
+from palm_jax.train import interrupts, locks, methods, records, table_page, workspace
 from palm_jax.train.config import Config, ConfigError
 from palm_jax.train.metrics import plain, write_json
 
@@ -39,6 +39,7 @@ _FIRST = ("palm", "bc")
 """Methods whose cells come first: the claim stands and falls with them."""
 
 _OTHER = ("palm-crop", "palm-overlay", "palm-aug", "palm-prop", "mirrorduo", "roviaug", "arro")
+_POLL_S = 0.1  # how soon the end of a cell, and a signal, are noticed
 _TASKS = ("lift_lid", "lift_spam", "insert_peg", "rearrange_veggies")
 _KEPT = (
     "robot", "other_robot", "demos", "demo_seed", "demo_noise", "image_size", "random_crop",
@@ -63,6 +64,7 @@ class TableConfig:
       shard: "i/n", the i-th of n machines (from 1): it takes every n-th cell. Each has its own
         folder and file; `--merge` joins the files.
       merge: files of other shards whose results are taken over; nothing is run.
+      take_over: run cells that a process on another machine has claimed, too: only if it is gone.
       page: a Markdown file that the results are written into; nothing is run.
     """
 
@@ -74,6 +76,7 @@ class TableConfig:
     json: Path | None = None
     shard: str = "1/1"
     merge: tuple[Path, ...] = ()
+    take_over: bool = False
     page: Path | None = None
 
     @property
@@ -178,6 +181,10 @@ def header(config: TableConfig) -> dict[str, Any]:
     }
 
 
+_START_ANEW = (
+    "move it and the .npz or .json file beside it away and call again; finished cells are taken "
+    "from their folders, and other shards' merged anew"
+)
 _MUST_AGREE = ("preset", "recipe", "domains", "versions")
 
 
@@ -189,7 +196,10 @@ def read(path: Path, fresh: dict[str, Any]) -> dict[str, Any]:
     """
     if not path.exists():
         return {"header": fresh, "results": {}, "failed": {}}
-    table: dict[str, Any] = records.load_json(path)
+    try:
+        table: dict[str, Any] = records.load_json(path)
+    except records.RecordError as error:
+        raise records.RecordError(f"{error}: {_START_ANEW}") from error
     old = table.get("header", {})
     for name in _MUST_AGREE:
         if old.get(name) != fresh[name]:
@@ -236,17 +246,33 @@ def run(config: TableConfig, console: Console) -> Path:
     asked, fresh = cells(config), header(config)
     table = read(config.file, fresh)
     if config.merge:
-        _merge_all(config, table, fresh)
+        with locks.locked(config.file):
+            _merge_all(config, read(config.file, fresh), fresh)
         return config.file
     missing = [cell for cell in asked if _get(table, "results", cell) is None]
     console.print(f"{len(asked)} cells, {len(asked) - len(missing)} done, into {config.file}")
     took: list[float] = []
     for number, cell in enumerate(missing):
-        _announce(console, cell, len(missing) - number, took)
-        start = time.monotonic()
-        log = config.folder / f"{cell.name}.log"
-        code = _train(cell_config(config, cell), log)
-        table = read(config.file, fresh)  # another shard may write beside us
+        try:
+            with locks.claim(config.folder / cell.name, take_over=config.take_over):
+                if _get(read(config.file, fresh), "results", cell) is None:
+                    _announce(console, cell, len(missing) - number, took)
+                    _run_cell(config, cell, fresh, console, took)
+        except locks.Busy as error:
+            hint = ", or call with --take-over" if error.elsewhere else ""
+            console.print(f"{cell.name} is left to another process: {error}{hint}", markup=False)
+    return config.file
+
+
+def _run_cell(
+    config: TableConfig, cell: Cell, fresh: dict[str, Any], console: Console, took: list[float]
+) -> None:
+    """Trains a cell that is claimed, and enters what came of it into the file."""
+    start = time.monotonic()
+    log = config.folder / f"{cell.name}.log"
+    code = _train(cell_config(config, cell), log)
+    with locks.locked(config.file):  # another process may write beside us
+        table = read(config.file, fresh)
         if code == 0 and (config.folder / cell.name / "eval.json").exists():
             _take(table, config, cell)
             took.append(time.monotonic() - start)
@@ -255,7 +281,6 @@ def run(config: TableConfig, console: Console) -> Path:
             console.print(f"{cell.name} failed (exit code {code}): see {log}", style="bold red")
         _note_origin(table["header"], fresh)
         write_json(config.file, table)
-    return config.file
 
 
 def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
@@ -283,7 +308,10 @@ def _note_speed(table: dict[str, Any]) -> None:
 def _keep_episodes(table: Path, fresh: Mapping[Cell, Mapping[str, records.DomainRecord]]) -> None:
     """Adds the episodes of cells to those beside the table."""
     path = table_page.episodes_file(table)
-    kept = records.load_eval(path) if path.exists() else {}
+    try:
+        kept = records.load_eval(path) if path.exists() else {}
+    except records.RecordError as error:
+        raise records.RecordError(f"{error}: {_START_ANEW}") from error
     for cell, by_domain in fresh.items():
         for domain, record in by_domain.items():
             kept[f"{cell.task}/{cell.method}/{cell.seed}/{domain}"] = record
@@ -310,16 +338,33 @@ def _train(config: Config, log: Path) -> int:
     with log.open("a") as output:
         output.write(f"$ {' '.join(words)}\n")
         output.flush()
-        done = subprocess.run(
+        # In a group of its own: a terminal's Ctrl-C reaches it through us, and once.
+        process = subprocess.Popen(
             [sys.executable, *words[1:]],
             stdout=output,
             stderr=subprocess.STDOUT,
             env=_environment(config.data.parents[1]),
             close_fds=False,
+            process_group=0,
         )
-    if done.returncode == 130:
+        return _outcome(process)
+
+
+def _outcome(process: subprocess.Popen[bytes]) -> int:
+    """Waits for a cell. A signal is passed on: the cell saves, and goes on another time."""
+    stop = interrupts.Stop("Stopping after the running cell has saved; once more ends at once.")
+    try:
+        with stop.listening():
+            while process.poll() is None and not stop():
+                time.sleep(_POLL_S)
+            if stop():
+                process.terminate()
+            code = process.wait()
+    finally:
+        process.kill()  # nothing, if it has ended
+    if stop() or code == 130:
         raise KeyboardInterrupt
-    return done.returncode
+    return code
 
 
 def _environment(folder: Path) -> dict[str, str]:
@@ -385,13 +430,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             written = table_page.write(config.file, config.page)
             console.print(f"Written: {', '.join(map(str, written))}", highlight=False)
             return 0
-        path = run(config, console)
-    except (ConfigError, records.RecordError) as error:
+        with interrupts.raising():
+            path = run(config, console)
+    except (ConfigError, records.RecordError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         console.print("Stopped; the same command goes on with what is missing.")
         return 130
-    failed = list(_cells_of(records.load_json(path), "failed"))
+    failed = list(_cells_of(records.load_json(path), "failed")) if path.exists() else []
     console.print(f"Results: {path}" + (f"; {len(failed)} cells failed" if failed else ""))
     return 1 if failed else 0
