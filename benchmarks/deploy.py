@@ -7,12 +7,13 @@ camera. Prints JSON.
 """
 
 import argparse
-import asyncio
 import contextlib
 import dataclasses
 import json
 import os
-import threading
+import re
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,7 +30,7 @@ from palm_jax.envs.rollout import Runner
 from palm_jax.policy import Policy, load
 from palm_jax.policy_client import PolicyClient
 from palm_jax.render import render
-from palm_jax.train import evaluate, methods, serve, workspace
+from palm_jax.train import evaluate, methods, workspace
 from palm_jax.train.evaluate import VIEW, Evaluator, Runners
 from palm_jax.train.learner import to_action
 
@@ -54,7 +55,7 @@ def latency(run: Path, calls: int) -> dict[str, Any]:
             policy.act(*observation)
         found[f"{height} x {width}"] = dataclasses.asdict(policy.latency)
         if (height, width) == SIZES[0]:
-            found[f"{height} x {width}, through a server"] = _served(policy, observation, calls)
+            found[f"{height} x {width}, through a server"] = _served(run, observation, calls)
     return found
 
 
@@ -69,8 +70,9 @@ def _sample(policy: Policy, height: int, width: int) -> list[Any]:
     return [image, K, camera, tcp, 1.0]
 
 
-def _served(policy: Policy, observation: list[Any], calls: int) -> dict[str, float]:
-    with _server(policy) as port, PolicyClient("127.0.0.1", port) as client:
+def _served(run: Path, observation: list[Any], calls: int) -> dict[str, float]:
+    """There and back, the server in a process of its own."""
+    with _server(run) as port, PolicyClient("127.0.0.1", port) as client:
         client.act(*observation)
         seconds = []
         for _ in range(calls):
@@ -88,28 +90,20 @@ def _served(policy: Policy, observation: list[Any], calls: int) -> dict[str, flo
 
 
 @contextlib.contextmanager
-def _server(policy: Policy) -> Iterator[int]:
-    """The policy's server in a thread of this process; its port."""
-    up, found = threading.Event(), {}
-
-    async def run() -> None:
-        found["stop"], found["loop"] = asyncio.Event(), asyncio.get_running_loop()
-
-        def started(port: int) -> None:
-            found["port"] = port
-            up.set()
-
-        server = serve.Server(policy.decide, serve.metadata_of(policy))
-        await server.run("127.0.0.1", 0, started=started, stop=found["stop"])
-
-    thread = threading.Thread(target=lambda: asyncio.run(run()))
-    thread.start()
-    up.wait()
+def _server(run: Path) -> Iterator[int]:
+    """`python -m palm_jax serve`; its port."""
+    words = [sys.executable, "-u", "-m", "palm_jax", "serve", str(run), "--port", "0"]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     try:
-        yield found["port"]
+        assert process.stdout is not None
+        for line in process.stdout:
+            if address := re.search(r"ws://[\d.]+:(\d+)", line):
+                yield int(address[1])
+                return
+        raise RuntimeError(f"the server did not start: {' '.join(words)}")
     finally:
-        found["loop"].call_soon_threadsafe(found["stop"].set)
-        thread.join()
+        process.terminate()
+        process.communicate()
 
 
 def cameras(run: Path, worlds: int) -> dict[str, Any]:

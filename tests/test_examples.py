@@ -22,7 +22,7 @@ def loop() -> ModuleType:
 
 
 class Lift:
-    """A robot whose hand is to be lifted to 0.3 m; where it is told to go it is at once."""
+    """A robot whose hand is to be lifted to 0.35 m; where it is told to go it is at once."""
 
     def __init__(self) -> None:
         self.tcp, self.commands = np.eye(4), []
@@ -36,7 +36,7 @@ class Lift:
     def move(self, target: np.ndarray, gripper: float) -> bool:
         self.tcp = target
         self.commands.append(gripper)
-        return bool(target[2, 3] > 0.3)
+        return bool(target[2, 3] > 0.35)
 
 
 def test_the_loop_goes_on_until_the_robot_says_so(loop: ModuleType) -> None:

@@ -14,6 +14,8 @@ ROOT = Path(__file__).resolve().parents[1]
 SHELL = ROOT / "palm_jax" / "__main__.py"
 # Short names for what train offers to other programs: they hold nothing but imports.
 DOORS = [ROOT / "palm_jax" / "policy.py"]
+# Run in a robot's process, which has no JAX.
+CLIENT = [ROOT / "palm_jax" / name for name in ("policy_client.py", "wire.py")]
 CORE = sorted(
     path
     for path in (ROOT / "palm_jax").rglob("*.py")
@@ -87,6 +89,15 @@ def test_core_imports_neither_mujoco_nor_upper_layers(path: Path) -> None:
     assert not offences(
         path.read_text(), "mujoco", "palm_jax.envs", "palm_jax.train", "flax", "optax", "h5py"
     )
+
+
+@pytest.mark.parametrize("path", CLIENT, ids=ids)
+def test_the_robots_side_imports_no_jax(path: Path) -> None:
+    names = {name.split(".")[0] for name in imported(path.read_text())}
+    others = names - set(sys.stdlib_module_names)
+    assert others <= {"msgpack", "numpy", "websockets", "palm_jax"}
+    ours = {name for name in imported(path.read_text()) if within(name, "palm_jax")}
+    assert ours <= {"palm_jax", "palm_jax.wire"}
 
 
 @pytest.mark.parametrize("path", DOORS, ids=ids)

@@ -233,6 +233,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     console = terminal.make_console()
     try:
         return _main(config, console)
+    except KeyboardInterrupt:  # before there is anything to end
+        return 130
     except (PolicyError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
