@@ -319,14 +319,14 @@ def _refuse_foreign(path: Path, manifest: Mapping[str, Any], fingerprint: str | 
 def _sweep_leftovers(directory: Path) -> None:
     for path in sorted(directory.glob(f"{SAVING}*")):
         step, _, pid = path.name.removeprefix(SAVING).partition("-")
-        if not _is_other_process(pid):
+        if not is_other_process(pid):
             _set_aside(path, f"{step}-unfinished", f"{path}: never completed (unfinished)")
     for path in directory.glob(f"{REMOVING}*"):
-        if not _is_other_process(path.name.rpartition("-")[2]):
+        if not is_other_process(path.name.rpartition("-")[2]):
             shutil.rmtree(path, ignore_errors=True)
 
 
-def _is_other_process(pid: str) -> bool:
+def is_other_process(pid: str) -> bool:
     """Whether a process of this number, not ours, is alive: it may still be writing."""
     if not pid.isdecimal() or int(pid) == os.getpid():
         return False

@@ -206,21 +206,19 @@ def _one_method(
 
 def _finished(folder: Path, console: Console) -> bool:
     """Whether a method's results are there and whole; damaged ones are set aside, to be redone."""
-    for path, read in (
-        (folder / "eval.npz", records.load_eval),
-        (folder / "eval.json", records.load_counts),
-    ):
-        if not path.exists():
-            return False
-        try:
-            read(path)
-        except records.RecordError as error:
-            aside = path.with_name(f"{path.name}.damaged")
-            os.replace(path, aside)
-            console.print(
-                f"{error}; set aside as {aside.name}, the evaluation is repeated", markup=False
-            )
-            return False
+    paths = [folder / "eval.json", folder / "eval.npz"]
+    if not paths[0].exists():
+        return False
+    try:
+        records.check_counts(paths[0], records.load_eval(paths[1]))
+    except records.RecordError as error:
+        for path in paths:
+            if path.exists():
+                os.replace(path, path.with_name(f"{path.name}.damaged"))
+        console.print(
+            f"{error}; both are set aside as *.damaged, the evaluation is repeated", markup=False
+        )
+        return False
     return True
 
 

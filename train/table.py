@@ -15,6 +15,8 @@ one lie in an .npz file beside it, laid out like eval.npz with TASK/METHOD/SEED/
 
 import dataclasses
 import datetime
+import hashlib
+import json
 import os
 import statistics
 import subprocess
@@ -207,7 +209,19 @@ def read(path: Path, fresh: dict[str, Any]) -> dict[str, Any]:
                 f"{path} was begun with {_difference(name, old.get(name), fresh[name])}: results "
                 "of two kinds are not mixed. Choose another --json and --out, or go back"
             )
+    if table.get("sha256", _digest(table)) != _digest(table):
+        raise records.RecordError(f"{path}: the content is not what was written: {_START_ANEW}")
     return table
+
+
+def _store(path: Path, table: dict[str, Any]) -> None:
+    write_json(path, {**table, "sha256": _digest(table)})
+
+
+def _digest(table: Mapping[str, Any]) -> str:
+    """Of a table's content, so that a digit that was changed is noticed."""
+    content = {name: value for name, value in table.items() if name != "sha256"}
+    return hashlib.sha256(json.dumps(plain(content), sort_keys=True).encode()).hexdigest()
 
 
 def _difference(name: str, old: Any, new: Any) -> str:
@@ -273,14 +287,24 @@ def _run_cell(
     code = _train(cell_config(config, cell), log)
     with locks.locked(config.file):  # another process may write beside us
         table = read(config.file, fresh)
-        if code == 0 and (config.folder / cell.name / "eval.json").exists():
+        if code == 0 and _whole(config.folder / cell.name, console):
             _take(table, config, cell)
             took.append(time.monotonic() - start)
         else:
             _put(table, "failed", cell, str(log))
             console.print(f"{cell.name} failed (exit code {code}): see {log}", style="bold red")
         _note_origin(table["header"], fresh)
-        write_json(config.file, table)
+        _store(config.file, table)
+
+
+def _whole(folder: Path, console: Console) -> bool:
+    """Whether a cell has left results that can be read."""
+    try:
+        records.check_counts(folder / "eval.json", records.load_eval(folder / "eval.npz"))
+    except records.RecordError as error:
+        console.print(f"{error}", markup=False)
+        return False
+    return True
 
 
 def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
@@ -411,7 +435,7 @@ def _merge_all(config: TableConfig, table: dict[str, Any], fresh: dict[str, Any]
             episodes.setdefault(Cell(task, method, int(seed)), {})[domain] = record
         _keep_episodes(config.file, {cell: episodes[cell] for cell in taken if cell in episodes})
     _note_speed(table)
-    write_json(config.file, table)
+    _store(config.file, table)
 
 
 def _cells_of(table: dict[str, Any], part: str) -> Iterator[Cell]:
