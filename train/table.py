@@ -40,6 +40,7 @@ from palm_jax.train.metrics import plain, write_json
 _FIRST = ("palm", "bc")
 """Methods whose cells come first: the claim stands and falls with them."""
 
+_POLL_S = 0.1  # how soon the end of a cell, and a signal, are noticed
 _KEPT = (
     "robot", "other_robot", "demos", "demo_seed", "demo_noise", "image_size", "random_crop",
     "width", "norm", "steps", "batch_size", "learning_rate", "schedule", "warmup_steps",
