@@ -172,7 +172,14 @@ def save(
 def _write_arrays(path: Path, named: Mapping[str, Any]) -> None:
     host = {name: np.asarray(leaf) for name, leaf in named.items()}
     # Orbax refuses arrays without elements; the manifest's shape and dtype say all about them.
-    ocp.save(path, nested({name: array for name, array in host.items() if array.size}))
+    tree = nested({name: array for name, array in host.items() if array.size})
+    try:
+        ocp.save(path, tree)
+    except OSError:
+        raise
+    except Exception as error:  # a full disk is a ValueError to Orbax, with a page of context
+        cause = str(error).rpartition(": ")[2]
+        raise OSError(f"{path.parent.parent}: the checkpoint cannot be written: {cause}") from error
 
 
 def _hash_files(folder: Path) -> dict[str, dict[str, Any]]:

@@ -16,7 +16,7 @@ from typing import Any
 import h5py
 import jax
 import numpy as np
-from faults.cases import Outcome, case, cut, flip, refused, snapshot
+from faults.cases import Outcome, case, cut, flip, flip_inside, refused, snapshot
 from rich.console import Console
 
 from palm_jax.envs import make
@@ -233,7 +233,7 @@ _EVAL_HARMS: tuple[tuple[str, str, Callable[[Path], Any], str], ...] = (
     ),
     ("eval.npz", "is cut in half", cut, "not a readable .npz file"),
     ("eval.npz", "is empty", lambda p: cut(p, 0), "not a readable .npz file"),
-    ("eval.npz", "has a flipped bit", flip, "eval.npz"),
+    ("eval.npz", "has a flipped bit", flip_inside, "eval.npz"),
     ("eval.npz", "is missing", lambda p: p.unlink(), "not a readable .npz file"),
     (
         "eval.npz",
@@ -279,7 +279,7 @@ def _damaged_sweep(folder: Path, shift: str, harm: Callable[[Path], Any]) -> Out
 
 
 for _shift in ("", "lighting"):
-    for _what, _harm in (("is cut in half", cut), ("has a flipped bit", flip)):
+    for _what, _harm in (("is cut in half", cut), ("has a flipped bit", flip_inside)):
         _file = records.sweep_path(Path(), shift=_shift).name
         case("results", f"{_file} {_what}", shift=_shift, harm=_harm)(_damaged_sweep)
 
@@ -379,7 +379,7 @@ _TABLE_HARMS: tuple[tuple[str, Callable[[Path], Any], str], ...] = (
         "the content is not what was written",
     ),
     ("table.npz is cut in half", lambda p: cut(p.with_suffix(".npz")), "not a readable .npz"),
-    ("table.npz has a flipped bit", lambda p: flip(p.with_suffix(".npz")), "table.npz"),
+    ("table.npz has a flipped bit", lambda p: flip_inside(p.with_suffix(".npz")), "table.npz"),
 )
 
 

@@ -9,6 +9,8 @@ from faults.cases import Case, Skipped, identifier
 SHORT = [case for case in campaign.CASES if not case.long]
 
 
+# When the disk is full, Orbax closes its event loop with writes under way.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("case", SHORT, ids=identifier)
 def test_nothing_is_lost_and_the_cause_is_named(case: Case, tmp_path: Path) -> None:
     try:
@@ -21,6 +23,6 @@ def test_nothing_is_lost_and_the_cause_is_named(case: Case, tmp_path: Path) -> N
 def test_the_page_tells_of_every_case() -> None:
     """It is written by `make faults`, which has to be called when a case is added."""
     assert len(campaign.CASES) >= 60 and len(SHORT) >= 60
-    text = campaign.PAGE.read_text()
-    rows = campaign.written_rows(text)
-    assert rows == [(case.group, case.name) for case in campaign.ordered()]
+    rows = campaign.rows_of(campaign.PAGE.read_text())
+    assert [row[:2] for row in rows] == [(case.group, case.name) for case in campaign.ordered()]
+    assert campaign.FAILED not in {row[2] for row in rows}
