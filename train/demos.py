@@ -248,6 +248,10 @@ def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None
         if found != value:
             advice = "; move it away and collect again" if name == "version" else ""
             raise DemoFileError(f"{path}: expected {name} {value!r}, found {found!r}{advice}")
+    if _DIGEST in data.attrs and data.attrs[_DIGEST] != _digest(data):
+        raise DemoFileError(
+            f"{path}: the content differs from what was written; move it away and collect again"
+        )
     demos = [data[f"demo_{i}"] for i in range(len(data))]
     if count is not None:
         if len(demos) < count:
@@ -268,10 +272,6 @@ def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None
     for name, array in arrays.items():
         if len(array) != sum(lengths) or not np.isfinite(array).all():
             raise DemoFileError(f"{path}: {name} is incomplete or not finite; collect again")
-    if _DIGEST in data.attrs and data.attrs[_DIGEST] != _digest(data):
-        raise DemoFileError(
-            f"{path}: the content differs from what was written; move it away and collect again"
-        )
     return Demos(
         **arrays,
         episode=np.repeat(np.arange(len(demos)), lengths),

@@ -192,7 +192,7 @@ def save_strengths(path: Path, sweep: StrengthSweep) -> Path:
 def load_strengths(path: Path) -> StrengthSweep:
     """Read a `StrengthSweep`."""
     arrays = load_arrays(path)
-    missing = {"shift", "strengths", "success", "nan"} - set(arrays)
+    missing = {field.name for field in fields(StrengthSweep)} - {"worlds", *arrays}
     if missing:
         raise RecordError(f"{path}: missing {', '.join(sorted(missing))}")
     strengths = np.atleast_1d(arrays["strengths"]).astype(float)

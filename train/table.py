@@ -40,9 +40,7 @@ from palm_jax.train.metrics import plain, write_json
 _FIRST = ("palm", "bc")
 """Methods whose cells come first: the claim stands and falls with them."""
 
-_OTHER = ("palm-crop", "palm-overlay", "palm-aug", "palm-prop", "mirrorduo", "roviaug", "arro")
 _POLL_S = 0.1  # how soon the end of a cell, and a signal, are noticed
-_TASKS = ("lift_lid", "lift_spam", "insert_peg", "rearrange_veggies")
 _KEPT = (
     "robot", "other_robot", "demos", "demo_seed", "demo_noise", "image_size", "random_crop",
     "width", "norm", "steps", "batch_size", "learning_rate", "schedule", "warmup_steps",
@@ -71,8 +69,8 @@ class TableConfig:
     """
 
     preset: str = "cpu"
-    tasks: tuple[str, ...] = _TASKS
-    methods: tuple[str, ...] = (*_FIRST, *_OTHER)
+    tasks: tuple[str, ...] = table_page.PAPER_TASKS
+    methods: tuple[str, ...] = table_page.PAPER_METHODS
     seeds: tuple[int, ...] = (0,)
     out: Path | None = None
     json: Path | None = None
@@ -326,7 +324,8 @@ def _note_speed(table: dict[str, Any]) -> None:
     training = [t["training_and_selection_s"] - t.get("selection_s", 0.0) for t in times]
     if training:
         header["samples_per_second"] = round(samples / statistics.median(training), 1)
-        header["evaluation_seconds"] = statistics.median(t["evaluation_s"] for t in times)
+        seconds = statistics.median(t["evaluation_s"] for t in times)
+        header["evaluation_seconds"] = round(seconds, 1)
 
 
 def _keep_episodes(table: Path, fresh: Mapping[Cell, Mapping[str, records.DomainRecord]]) -> None:

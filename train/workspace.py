@@ -183,10 +183,21 @@ def best_policy(folder: Path, learner: Learner, belongs: str | None = None) -> P
     Raises:
       ConfigError: there is none.
     """
+    _, path = best_checkpoint(folder, belongs)
+    return learner.policy_state(checkpoint.load(path, learner.abstract_state()))
+
+
+def best_checkpoint(folder: Path, belongs: str | None = None) -> tuple[int, Path]:
+    """(step, path) of the checkpoint in `folder/checkpoints` with the best in-domain success; of
+    those of a `fingerprint`.
+
+    Raises:
+      ConfigError: there is none.
+    """
     best = checkpoint.best(folder / "checkpoints", fingerprint=belongs)
     if not best:
         raise ConfigError(f"{folder}/checkpoints holds no whole, scored checkpoint: train first")
-    return learner.policy_state(checkpoint.load(best[0][1], learner.abstract_state()))
+    return best[0]
 
 
 def quoted_variant(folder: Path) -> str:

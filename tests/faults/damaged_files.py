@@ -479,7 +479,7 @@ _DEMO_HARMS: tuple[tuple[str, Callable[[Path], Any], str], ...] = (
     ("is no HDF5", lambda p: p.write_bytes(b"text" * 500), "not a whole demonstration file"),
     ("has another superblock", lambda p: flip(p, 8, bit=6), "not a whole demonstration file"),
     ("has another number", _edit(_changed), "the content differs from what was written"),
-    ("lacks a demonstration", _edit(lambda d: d.pop("demo_0")), "not a whole demonstration file"),
+    ("lacks a demonstration", _edit(lambda d: d.pop("demo_0")), "differs from what was written"),
     ("has a NaN", _edit(_nan), "actions is incomplete or not finite"),
     ("is of another task", _edit(lambda d: d.attrs.update(task="x")), "expected task 'lift_lid'"),
     ("is of another version", _edit(lambda d: d.attrs.update(version=1)), "expected version 2"),
