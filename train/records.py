@@ -13,6 +13,7 @@ names the file and the problem.
 
 import io
 import json
+import struct
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -82,6 +83,9 @@ class StrengthSweep:
         """[K, S] successes that count: a non-finite episode never does."""
         return self.success & ~self.nan
 
+
+_ZIP_END = struct.Struct("<4s4H2LH")
+"""The end of a ZIP file: signature, disks, entries (twice), the directory's size and start."""
 
 _DTYPES: dict[str, Any] = {
     "success": np.bool_,
@@ -213,11 +217,30 @@ def _worlds(arrays: Mapping[str, NDArray[Any]]) -> int:
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Read an .npz file without pickles."""
     try:
+        content = path.read_bytes()
         # From memory: NumPy leaves a file that it cannot read open.
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            _check_directory(content, len(archive.files))
             return {name: archive[name] for name in archive.files}
     except Exception as error:  # damaged bytes make zipfile and NumPy raise whatever comes to mind
         raise RecordError(f"{path}: not a readable .npz file ({error})") from error
+
+
+def _check_directory(content: bytes, count: int) -> None:
+    """Raises ValueError for an archive whose directory hides some of its arrays.
+
+    Every array has a checksum, but the directory has none: a byte of it can make an entry swallow
+    the next ones, and zipfile does not compare what it found with the number at the end.
+    """
+    end = content[-_ZIP_END.size :]
+    if len(end) < _ZIP_END.size:
+        raise ValueError("it ends early")
+    signature, _, _, _, entries, size, start, _ = _ZIP_END.unpack(end)
+    large = entries == 0xFFFF  # then the number is elsewhere
+    if signature != b"PK\x05\x06" or not (
+        large or (entries == count and start + size + _ZIP_END.size == len(content))
+    ):
+        raise ValueError("its directory is damaged")
 
 
 def load_eval(path: Path) -> dict[str, DomainRecord]:
