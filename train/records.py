@@ -15,7 +15,7 @@ import io
 import json
 import struct
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -103,6 +103,7 @@ def domain_record(values: Mapping[str, ArrayLike], *, where: str = "record") -> 
     `draws` may be missing: it was not always recorded.
     """
     values = {"draws": np.zeros(np.shape(values.get("success", ())), np.int32), **values}
+    _refuse_unknown(where, values, _DTYPES)
     missing = sorted(set(_DTYPES) - set(values))
     if missing:
         raise RecordError(f"{where}: missing {', '.join(missing)}; expected {', '.join(_DTYPES)}")
@@ -116,6 +117,13 @@ def domain_record(values: Mapping[str, ArrayLike], *, where: str = "record") -> 
                 f"got {array.shape}"
             )
     return DomainRecord(**arrays)
+
+
+def _refuse_unknown(where: object, found: Iterable[str], known: Iterable[str]) -> None:
+    """A name that is not ours may be one of ours, damaged, and its array be taken for absent."""
+    unknown = sorted(set(found) - set(known))
+    if unknown:
+        raise RecordError(f"{where}: unknown {', '.join(unknown)}; expected {', '.join(known)}")
 
 
 def joined(parts: Sequence[DomainRecord]) -> DomainRecord:
@@ -196,6 +204,7 @@ def save_strengths(path: Path, sweep: StrengthSweep) -> Path:
 def load_strengths(path: Path) -> StrengthSweep:
     """Read a `StrengthSweep`."""
     arrays = load_arrays(path)
+    _refuse_unknown(path, arrays, [field.name for field in fields(StrengthSweep)])
     missing = {field.name for field in fields(StrengthSweep)} - {"worlds", *arrays}
     if missing:
         raise RecordError(f"{path}: missing {', '.join(sorted(missing))}")
@@ -259,6 +268,7 @@ def load_eval(path: Path) -> dict[str, DomainRecord]:
 def load_sweep(path: Path) -> Sweep:
     """Read sweep.npz."""
     arrays = load_arrays(path)
+    _refuse_unknown(path, arrays, [field.name for field in fields(Sweep)])
     missing = {"angles", "xs", "ys", "success"} - set(arrays)
     if missing:
         raise RecordError(f"{path}: missing {', '.join(sorted(missing))}")

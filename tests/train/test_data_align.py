@@ -569,9 +569,12 @@ def test_repair_of_a_cut_file_takes_nothing_for_zeros(
             np.testing.assert_array_equal(saved[key], value, err_msg=key)
 
 
-def test_a_cut_file_from_which_something_can_be_saved(aligned: Path, tmp_path: Path) -> None:
-    """The second episode lies at the end of a file that `data align` has written."""
-    content = aligned.read_bytes()
+@pytest.mark.parametrize("kind", ["robosuite", "aligned"])
+def test_a_cut_file_from_which_something_can_be_saved(
+    kind: str, aligned: Path, tmp_path: Path
+) -> None:
+    """The second episode lies at the end."""
+    content = (aligned if kind == "aligned" else datasets.LIFT).read_bytes()
     cut = tmp_path / "cut.hdf5"
     cut.write_bytes(content[: int(0.8 * len(content))])
     result = data.repair(cut, tmp_path / "saved.hdf5")

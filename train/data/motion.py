@@ -249,12 +249,18 @@ def _thumbnails(recording: Recording) -> list[tuple[str, np.ndarray, np.ndarray]
         tcp = recording.trajectory(name).tcp[:, :3, 3]
         pictures: list[np.ndarray] = []
         for block in source.blocks(name, recording.image_key, BLOCK):
-            pictures += [_pooled(image.mean(-1), _THUMBNAIL) for image in block]
+            pictures += [_thumbnail(image) for image in block]
             if len(pictures) >= _FRAMES // count:
                 break
         rows = min(len(pictures), len(tcp))
         result.append((name, np.stack(pictures[:rows]), tcp[:rows]))
     return result
+
+
+def _thumbnail(image: np.ndarray) -> np.ndarray:
+    """Grey [96, 96] of an image [H, W, 3]; of a large one, only some pixels count."""
+    step = max(1, min(image.shape[:2]) // (2 * _THUMBNAIL))
+    return _pooled(image[::step, ::step].mean(-1), _THUMBNAIL)
 
 
 def _pooled(picture: np.ndarray, side: int) -> np.ndarray:

@@ -101,7 +101,7 @@ def _count(source: Source, name: str, key: str) -> int:
 
 
 def _hdf5_episode(source: RobomimicSource, name: str, length: int) -> list[str]:
-    demo = source.data[name]
+    demo = source.demo(name)
     problems = []
     told = demo.attrs.get("num_samples")
     if told is None or int(told) != length:
@@ -261,8 +261,8 @@ class _CutSource(RobomimicSource):
         except (OSError, RuntimeError, KeyError, ValueError) as error:
             self._padded.close()
             raise TruncatedError(
-                f"{path}: so much is missing ({self._real} of {size} bytes) that not even the list "
-                f"of episodes can be read ({error}); copy the file again"
+                f"{path}: so much is missing ({self._real} of {size} bytes are there) that no "
+                "episode can be read; copy the file again"
             ) from error
 
     def lost(self, name: str) -> str:
@@ -271,15 +271,15 @@ class _CutSource(RobomimicSource):
             for key, dataset in self.datasets(name, every=True):
                 if _end(dataset) > self._real:
                     return key
-            dict(self.data[name].attrs)
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
-            return f"part of its structure ({error})"
+            dict(self.demo(name).attrs)
+        except (DataError, OSError, RuntimeError, KeyError, ValueError):
+            return "part of its structure"
         return ""
 
     def length(self, episode: str) -> int:
         try:
             return super().length(episode)
-        except (OSError, RuntimeError, KeyError, ValueError):
+        except (DataError, OSError, RuntimeError, KeyError, ValueError):
             return 0
 
     def close(self) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from palm_jax.train.data.errors import FormatError, KeyMissingError
 
-WHOLE_HASH_BYTES = 2**30
+WHOLE_HASH_BYTES = 2**28
 """Larger sources are identified by their sizes and both ends of every file: hashing them whole
 would take as long as aligning them."""
 
