@@ -28,11 +28,13 @@ VERBS: dict[str, Verb] = {
     "sweep": Verb("palm_jax.train.sweep", "success over a grid of shifts, for a finished run"),
     "table": Verb("palm_jax.train.table", "every cell of the paper's main table, resumable"),
     "report": Verb("palm_jax.train.report", "one self-contained HTML page from run folders"),
+    "data": Verb("palm_jax.train.data.commands", "your own robot data: inspect, check, align"),
     "show": Verb("palm_jax.train.show", "pictures of every task, robot and shift, as PNG"),
     "serve": Verb("palm_jax.train.serve", "a policy behind a websocket, for a robot", "serve"),
     "export": Verb(
         "palm_jax.train.export", "a policy as StableHLO, for use without Python", "export"
     ),
+    "debug": Verb("palm_jax.train.debug", "repeat and explain an update that failed"),
     "bench": Verb("benchmarks.__main__", "speed, side by side with peers (needs a checkout)"),
 }
 

@@ -49,6 +49,7 @@ from palm_jax.align.augment import (
 from palm_jax.align.camera import Camera, project, unproject, unproject_to_height
 from palm_jax.align.crop import resize, tcp_crop
 from palm_jax.align.isolate import isolate
+from palm_jax.align.lens import distort_points, undistort, undistort_points
 from palm_jax.align.overlay import tcp_overlay
 from palm_jax.align.pipeline import Aligned, AlignSpec, align, align_window, window_origin
 from palm_jax.align.proprio import matrix_from_6d, proprio, rotation_6d
@@ -71,6 +72,7 @@ __all__ = [
     "align_window",
     "apply_delta",
     "center_crop",
+    "distort_points",
     "encode_delta",
     "gripper_labels",
     "isolate",
@@ -92,6 +94,8 @@ __all__ = [
     "tcp_crop",
     "tcp_overlay",
     "turn_view",
+    "undistort",
+    "undistort_points",
     "unproject",
     "unproject_to_height",
     "window_origin",
