@@ -29,7 +29,7 @@ def verb(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 def test_help_lists_every_verb(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(words) == 0
     out = capsys.readouterr().out
-    for name in ("train", "sweep", "report", "show", "bench"):
+    for name in ("train", "sweep", "report", "data", "show", "bench"):
         assert f"\n  {name} " in out
 
 
@@ -42,7 +42,7 @@ def test_unknown_verb_lists_the_known_ones(capsys: pytest.CaptureFixture[str]) -
     assert cli.main(["tarin"]) == 2
     err = capsys.readouterr().err
     assert "unknown verb 'tarin'. Did you mean 'train'?" in err
-    assert "Known verbs: train, sweep, table, report, show, bench" in err
+    assert "Known verbs: train, sweep, table, report, data, show, bench" in err
 
 
 def test_verb_gets_its_words_and_its_status_is_returned(
