@@ -411,7 +411,7 @@ class Align:
       layout: of the proprioception.
       border: what happens where the window leaves the frame.
       axis_length: of the overlay, metres.
-      spec: fields of AlignSpec as JSON, in a file or here; they come before the options above.
+      spec: fields of AlignSpec as JSON, in a file or here; they override the options above.
       format: of the output; by default the input's.
       keep: of the source: numbers (all but images), all, or none.
       compression: of the images in HDF5.
