@@ -185,7 +185,7 @@ def step_towards(
     *,
     gain: float = STEP_GAIN,
     max_distance: float = 0.006,
-    max_angle: float = 0.07,
+    max_angle: float = 0.03,
 ) -> jax.Array:
     """Next pose [4, 4] on the way from `tcp` to `target`, both [4, 4]: a saturated proportional
     step.

@@ -14,9 +14,11 @@ NOISE = 0.004
 """Default standard deviation (metres) of the disturbance of each commanded translation."""
 
 _CORRELATION = 0.8  # of the disturbance from one control step to the next: it pushes, not trembles
-# Share of the disturbance that is left once the gripper closes. A lift rises 4 mm a step, no more
-# than the whole disturbance: with that it would neither rise steadily nor straight.
+# Share of the disturbance that is left from when the gripper closes until it is open again. A lift
+# rises 4 mm a step, no more than the whole disturbance: with that it would neither rise steadily
+# nor straight; and fingers that let go would knock what they put down off its place.
 _HELD_SHARE = 0.3
+_FREE_OPENING = 0.95  # of the gripper (0..1): from there on it holds nothing
 _YAW_NOISE = 4.0  # radians of disturbance per metre: 4 mm go with about 1 degree
 
 
@@ -102,10 +104,17 @@ class Demonstrator:
     ) -> "_Command":
         env = self.runner.env
         action = env.expert(state)
-        fresh = jax.random.normal(key, (4,)) * noise
-        push = _CORRELATION * push + jnp.sqrt(1 - _CORRELATION**2) * fresh
-        scaled = jnp.where(action[9] > 0.5, 1.0, _HELD_SHARE) * push
-        return _Command(action, disturbed(action, scaled), push, env.tcp(state), env.opening(state))
+        opening = env.opening(state)
+        free = (action[9] > 0.5) & (opening > _FREE_OPENING)
+        push = next_push(key, push, noise)
+        scaled = jnp.where(free, 1.0, _HELD_SHARE) * push
+        return _Command(action, disturbed(action, scaled), push, env.tcp(state), opening)
+
+
+def next_push(key: jax.Array, push: jax.Array, noise: jax.Array) -> jax.Array:
+    """The disturbance [4] that follows on `push` [4], of standard deviation `noise` [] (metres)."""
+    fresh = jax.random.normal(key, (4,)) * noise
+    return _CORRELATION * push + jnp.sqrt(1 - _CORRELATION**2) * fresh
 
 
 def disturbed(action: jax.Array, push: jax.Array) -> jax.Array:

@@ -137,6 +137,10 @@ class Runner:
         self._reposition = physics.jit_physics(jax.vmap(env.reposition))
         self._views: dict[Hashable, Callable[..., Any]] = {}
 
+    def halved(self) -> "Runner":
+        """The same environment for half as many worlds (at least one): compiled anew."""
+        return Runner(self.env, max(self.worlds // 2, 1))
+
     def reset(self, keys: jax.Array, params: EnvParams) -> State:
         """`Env.reset` of W worlds, in three compiled pieces.
 

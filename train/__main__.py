@@ -17,8 +17,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         from palm_jax.envs.rollout import StartPoseError
         from palm_jax.train import config as configuration
         from palm_jax.train import console as terminal
-        from palm_jax.train import run
+        from palm_jax.train import interrupts, run
         from palm_jax.train.demos import DemoFileError
+        from palm_jax.train.learner import NonFiniteError
+        from palm_jax.train.locks import Busy
+        from palm_jax.train.records import RecordError
 
     console = terminal.make_console()
     try:
@@ -27,10 +30,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     try:
-        run.execute(config, console)
-    except (configuration.ConfigError, DemoFileError, StartPoseError) as error:
+        with interrupts.raising():
+            run.execute(config, console)
+    except (configuration.ConfigError, DemoFileError, StartPoseError, RecordError, Busy) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except (NonFiniteError, MemoryError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         terminal.interrupted(console, run.resume_command(config))
         return 130

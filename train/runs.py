@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from palm_jax.train import grids, paper, records
 
 Counts = dict[str, dict[str, int]]  # domain -> successes, episodes, nan
@@ -126,15 +124,7 @@ def pooled_episodes(runs: Iterable[Run]) -> dict[str, records.DomainRecord]:
     for run in runs:
         for domain, record in run.episodes.items():
             parts.setdefault(domain, []).append(record)
-    return {
-        domain: records.DomainRecord(
-            *(
-                np.concatenate([getattr(part, name.name) for part in pieces])
-                for name in dataclasses.fields(records.DomainRecord)
-            )
-        )
-        for domain, pieces in parts.items()
-    }
+    return {domain: records.joined(pieces) for domain, pieces in parts.items()}
 
 
 def lookup(tree: Any, name: str) -> Any:

@@ -9,6 +9,7 @@ cell.
 """
 
 import dataclasses
+import hashlib
 import re
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -23,9 +24,9 @@ from rich.console import Console
 
 from palm_jax.envs import registry, shifts
 from palm_jax.envs.base import EnvParams
-from palm_jax.envs.rollout import repeat_params, take_params
+from palm_jax.envs.rollout import Episodes, repeat_params
 from palm_jax.train import console as terminal
-from palm_jax.train import records, report, runs, workspace
+from palm_jax.train import interrupts, locks, records, report, runs, workspace
 from palm_jax.train.evaluate import Evaluator, Runners
 from palm_jax.train.learner import PolicyState
 
@@ -134,6 +135,7 @@ def sweep(
     seed: int,
     aligned: bool,
     progress: Callable[[int], None] | None = None,
+    partial_file: Path | None = None,
 ) -> records.Sweep:
     """Runs every cell of the grid.
 
@@ -145,23 +147,21 @@ def sweep(
       seed: of the scenes.
       aligned: whether the hand's initial yaw turns with the camera.
       progress: told how many episodes were finished.
+      partial_file: where finished episodes are kept meanwhile; those that are there are taken over.
     """
     params = evaluator.runner.env.default_params()
     if aligned:
         params = shifts.aligned_hand(params)
     cells = cell_params(params, angles, xs, ys, episodes)
-    total, batch = len(angles) * len(xs) * len(ys) * episodes, evaluator.runner.worlds
-    success, nan = np.zeros(total, bool), np.zeros(total, bool)
-    for first in range(0, total, batch):
-        rows = np.arange(first, min(first + batch, total))
-        part = take_params(cells, rows)
-        scenes = jax.random.fold_in(jax.random.key(seed), first)
-        result = evaluator.episodes(policy, scenes, part, len(rows))
-        success[rows], nan[rows] = result.success, result.nan
-        if progress:
-            progress(len(rows))
     shape = (len(angles), len(xs), len(ys), episodes)
-    return records.Sweep(angles, xs, ys, success.reshape(shape), nan.reshape(shape))
+    question = _digest("grid", angles, xs, ys, episodes, seed, aligned, policy)
+    found = _Found(partial_file, question, int(np.prod(shape)), progress)
+    scenes = jax.random.fold_in(jax.random.key(seed), 0)
+    for rows, part in evaluator.batches(policy, scenes, cells, found.total, first=found.done):
+        found.add(rows, part)
+    return records.Sweep(
+        angles, xs, ys, found.success.reshape(shape), found.nan.reshape(shape), _worlds(evaluator)
+    )
 
 
 def sweep_strength(
@@ -174,6 +174,7 @@ def sweep_strength(
     seed: int,
     aligned: bool,
     progress: Callable[[int], None] | None = None,
+    partial_file: Path | None = None,
 ) -> records.StrengthSweep:
     """Runs the same scenes at every strength of a shift.
 
@@ -186,19 +187,88 @@ def sweep_strength(
       seed: of the scenes.
       aligned: whether the hand's initial yaw turns with the camera.
       progress: told how many episodes were finished.
-
+      partial_file: as for `sweep`.
     """
     params = evaluator.runner.env.default_params()
     if aligned:
         params = shifts.aligned_hand(params)
-    success, nan = np.zeros((2, len(strengths), episodes), bool)
+    shape = (len(strengths), episodes)
+    question = _digest(shift, strengths, episodes, seed, aligned, policy)
+    found = _Found(partial_file, question, int(np.prod(shape)), progress)
+    scenes = jax.random.key(seed)
     for row, strength in enumerate(strengths):
+        begin = row * episodes
+        first = max(found.done - begin, 0)
+        if first >= episodes:
+            continue
         there = repeat_params(shifts.shifted(params, shift, strength=float(strength)), episodes)
-        result = evaluator.episodes(policy, jax.random.key(seed), there, episodes)
-        success[row], nan[row] = result.success, result.nan
-        if progress:
-            progress(episodes)
-    return records.StrengthSweep(shift, strengths, success, nan)
+        for rows, part in evaluator.batches(policy, scenes, there, episodes, first=first):
+            found.add(begin + rows, part)
+    success, nan = found.success.reshape(shape), found.nan.reshape(shape)
+    return records.StrengthSweep(shift, strengths, success, nan, _worlds(evaluator))
+
+
+def _worlds(evaluator: Evaluator) -> int:
+    return evaluator.runner.worlds
+
+
+def _digest(*values: Any) -> str:
+    """Of a question: numbers, texts and trees of arrays."""
+    digest = hashlib.sha256()
+    for value in values:
+        for leaf in jax.tree.leaves(value):
+            array = np.asarray(leaf)
+            digest.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()
+
+
+class _Found:
+    """Outcomes in their order, kept in a file from batch to batch: a sweep takes hours."""
+
+    def __init__(
+        self,
+        path: Path | None,
+        question: str,
+        total: int,
+        progress: Callable[[int], None] | None,
+    ) -> None:
+        """What the file holds of the same `question` is taken over; `progress` is told of it."""
+        self.total, self.done = total, 0
+        self.success, self.nan = np.zeros((2, total), bool)
+        self._path, self._question, self._progress = path, question, progress
+        if path is not None and path.exists():
+            self._take_over(path)
+
+    def _take_over(self, path: Path) -> None:
+        try:
+            kept = records.load_arrays(path)
+            if str(kept["question"]) != self._question:
+                return
+            success, nan = kept["success"].astype(bool), kept["nan"].astype(bool)
+        except (records.RecordError, KeyError):
+            return  # damaged: these episodes are run again
+        if success.shape != nan.shape or success.ndim != 1 or len(success) > self.total:
+            return
+        self.done = len(success)
+        self.success[: self.done], self.nan[: self.done] = success, nan
+        self._tell(self.done)
+
+    def add(self, rows: np.ndarray, part: Episodes) -> None:
+        """The outcomes of the next rows."""
+        self.success[rows], self.nan[rows] = part.success, part.nan
+        self.done = int(rows[-1]) + 1
+        if self._path is not None:
+            arrays = {
+                "question": np.array(self._question),
+                "success": self.success[: self.done],
+                "nan": self.nan[: self.done],
+            }
+            records.save_arrays(self._path, arrays)
+        self._tell(len(rows))
+
+    def _tell(self, count: int) -> None:
+        if self._progress and count:
+            self._progress(count)
 
 
 class Job(NamedTuple):
@@ -208,6 +278,14 @@ class Job(NamedTuple):
     episodes: int  # in all
     run: Callable[..., Any]  # `sweep` or `sweep_strength`, their grids bound
     save: Callable[[Path, Any], Path]
+
+    def perform(self, path: Path, evaluator: Evaluator, policy: PolicyState, **options: Any) -> Any:
+        """Runs it into a file, by way of a partial one beside that; `options`: see `sweep`."""
+        kept = path.with_name(f".{path.name}.partial")
+        found = self.run(evaluator, policy, partial_file=kept, **options)
+        self.save(path, found)
+        kept.unlink(missing_ok=True)
+        return found
 
 
 def job(config: SweepConfig) -> Job:
@@ -239,10 +317,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     config = tyro.cli(SweepConfig, args=argv, prog="python -m palm_jax sweep")
     console = terminal.make_console()
     try:
-        _run(config, console)
-    except (ValueError, OSError) as error:
+        with interrupts.raising():
+            _run(config, console)
+    except (ValueError, OSError, MemoryError) as error:
         console.print(f"error: {error}", markup=False)
         return 2
+    except KeyboardInterrupt:
+        console.print("Stopped; the same command goes on with the batch that was running.")
+        return 130
     return report.main([str(config.run)])
 
 
@@ -266,15 +348,32 @@ def _run(config: SweepConfig, console: Console) -> None:
             continue
         world = stored.task, robot
         if world not in runners:
-            runners[world] = Runners.of(stored.task, robot, stored.second_robot, asked.worlds)
-        evaluator, policy = workspace.load_policy(folder, runners[world])
-        label = f"sweep {evaluator.method.name}"
-        with terminal.ProgressBar(console, asked.episodes, label, unit="episode") as bar:
-            found = asked.run(
-                evaluator,
-                policy,
-                seed=config.seed,
-                aligned=workspace.quoted_variant(folder) == "aligned",
-                progress=bar.advance,
+            runners[world] = Runners.of(
+                stored.task,
+                robot,
+                stored.second_robot,
+                asked.worlds,
+                tell=lambda text: console.print(text, style="bold", markup=False),
             )
-        asked.save(path, found)
+        try:
+            with locks.claim(folder, name=f".{path.stem}.claim"):
+                _sweep_one(folder, path, asked, config.seed, runners[world], console)
+        except locks.Busy as error:
+            console.print(f"{path} is left to another process: {error}", markup=False)
+
+
+def _sweep_one(
+    folder: Path, path: Path, asked: Job, seed: int, runners: Runners, console: Console
+) -> None:
+    """One policy's file."""
+    evaluator, policy = workspace.load_policy(folder, runners)
+    label = f"sweep {evaluator.method.name}"
+    with terminal.ProgressBar(console, asked.episodes, label, unit="episode") as bar:
+        asked.perform(
+            path,
+            evaluator,
+            policy,
+            seed=seed,
+            aligned=workspace.quoted_variant(folder) == "aligned",
+            progress=bar.advance,
+        )

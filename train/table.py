@@ -8,16 +8,21 @@ once for each task. Finished cells go into one JSON file at once:
     {"header": {...}, "results": {task: {method: {seed: {domain: {"successes", "episodes",
     "nan"}}}}}, "failed": {task: {method: {seed: log}}}}
 
-The header says under which conditions; a file with another one is not touched.
+The header says under which conditions; a file with another one is not touched. The episodes one by
+one lie in an .npz file beside it, laid out like eval.npz with TASK/METHOD/SEED/DOMAIN for names.
+`--page` makes Markdown and figures of the two.
 """
 
 import dataclasses
 import datetime
+import hashlib
+import json
 import os
+import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,15 +33,14 @@ from palm_jax.envs.registry import TASKS
 from palm_jax.envs.shifts import DOMAINS
 from palm_jax.train import config as configuration
 from palm_jax.train import console as terminal
-from palm_jax.train import methods, records, workspace
+from palm_jax.train import interrupts, locks, methods, records, table_page, workspace
 from palm_jax.train.config import Config, ConfigError
 from palm_jax.train.metrics import plain, write_json
 
 _FIRST = ("palm", "bc")
 """Methods whose cells come first: the claim stands and falls with them."""
 
-_OTHER = ("palm-crop", "palm-overlay", "palm-aug", "palm-prop", "mirrorduo", "roviaug", "arro")
-_TASKS = ("lift_lid", "lift_spam", "insert_peg", "rearrange_veggies")
+_POLL_S = 0.1  # how soon the end of a cell, and a signal, are noticed
 _KEPT = (
     "robot", "other_robot", "demos", "demo_seed", "demo_noise", "image_size", "random_crop",
     "width", "norm", "steps", "batch_size", "learning_rate", "schedule", "warmup_steps",
@@ -60,16 +64,20 @@ class TableConfig:
       shard: "i/n", the i-th of n machines (from 1): it takes every n-th cell. Each has its own
         folder and file; `--merge` joins the files.
       merge: files of other shards whose results are taken over; nothing is run.
+      take_over: run cells that a process on another machine has claimed, too: only if it is gone.
+      page: a Markdown file that the results are written into; nothing is run.
     """
 
     preset: str = "cpu"
-    tasks: tuple[str, ...] = _TASKS
-    methods: tuple[str, ...] = (*_FIRST, *_OTHER)
+    tasks: tuple[str, ...] = table_page.PAPER_TASKS
+    methods: tuple[str, ...] = table_page.PAPER_METHODS
     seeds: tuple[int, ...] = (0,)
     out: Path | None = None
     json: Path | None = None
     shard: str = "1/1"
     merge: tuple[Path, ...] = ()
+    take_over: bool = False
+    page: Path | None = None
 
     @property
     def folder(self) -> Path:
@@ -173,6 +181,10 @@ def header(config: TableConfig) -> dict[str, Any]:
     }
 
 
+_START_ANEW = (
+    "move it and the .npz or .json file beside it away and call again; finished cells are taken "
+    "from their folders, and other shards' merged anew"
+)
 _MUST_AGREE = ("preset", "recipe", "domains", "versions")
 
 
@@ -184,7 +196,10 @@ def read(path: Path, fresh: dict[str, Any]) -> dict[str, Any]:
     """
     if not path.exists():
         return {"header": fresh, "results": {}, "failed": {}}
-    table: dict[str, Any] = records.load_json(path)
+    try:
+        table: dict[str, Any] = records.load_json(path)
+    except records.RecordError as error:
+        raise records.RecordError(f"{error}: {_START_ANEW}") from error
     old = table.get("header", {})
     for name in _MUST_AGREE:
         if old.get(name) != fresh[name]:
@@ -192,7 +207,19 @@ def read(path: Path, fresh: dict[str, Any]) -> dict[str, Any]:
                 f"{path} was begun with {_difference(name, old.get(name), fresh[name])}: results "
                 "of two kinds are not mixed. Choose another --json and --out, or go back"
             )
+    if table.get("sha256", _digest(table)) != _digest(table):
+        raise records.RecordError(f"{path}: the content is not what was written: {_START_ANEW}")
     return table
+
+
+def _store(path: Path, table: dict[str, Any]) -> None:
+    write_json(path, {**table, "sha256": _digest(table)})
+
+
+def _digest(table: Mapping[str, Any]) -> str:
+    """Of a table's content, so that a digit that was changed is noticed."""
+    content = {name: value for name, value in table.items() if name != "sha256"}
+    return hashlib.sha256(json.dumps(plain(content), sort_keys=True).encode()).hexdigest()
 
 
 def _difference(name: str, old: Any, new: Any) -> str:
@@ -230,30 +257,88 @@ def run(config: TableConfig, console: Console) -> Path:
     """
     asked, fresh = cells(config), header(config)
     table = read(config.file, fresh)
-    for path in config.merge:
-        _merge(table, path, fresh)
     if config.merge:
-        write_json(config.file, table)
+        with locks.locked(config.file):
+            _merge_all(config, read(config.file, fresh), fresh)
         return config.file
     missing = [cell for cell in asked if _get(table, "results", cell) is None]
     console.print(f"{len(asked)} cells, {len(asked) - len(missing)} done, into {config.file}")
     took: list[float] = []
     for number, cell in enumerate(missing):
-        _announce(console, cell, len(missing) - number, took)
-        start = time.monotonic()
-        log = config.folder / f"{cell.name}.log"
-        code = _train(cell_config(config, cell), log)
-        counts = config.folder / cell.name / "eval.json"
-        table = read(config.file, fresh)  # another shard may write beside us
-        if code == 0 and counts.exists():
-            _put(table, "results", cell, records.load_counts(counts))
-            _drop(table, "failed", cell)
+        try:
+            with locks.claim(config.folder / cell.name, take_over=config.take_over):
+                if _get(read(config.file, fresh), "results", cell) is None:
+                    _announce(console, cell, len(missing) - number, took)
+                    _run_cell(config, cell, fresh, console, took)
+        except locks.Busy as error:
+            hint = ", or call with --take-over" if error.elsewhere else ""
+            console.print(f"{cell.name} is left to another process: {error}{hint}", markup=False)
+    return config.file
+
+
+def _run_cell(
+    config: TableConfig, cell: Cell, fresh: dict[str, Any], console: Console, took: list[float]
+) -> None:
+    """Trains a cell that is claimed, and enters what came of it into the file."""
+    start = time.monotonic()
+    log = config.folder / f"{cell.name}.log"
+    code = _train(cell_config(config, cell), log)
+    with locks.locked(config.file):  # another process may write beside us
+        table = read(config.file, fresh)
+        if code == 0 and _whole(config.folder / cell.name, console):
+            _take(table, config, cell)
             took.append(time.monotonic() - start)
         else:
             _put(table, "failed", cell, str(log))
             console.print(f"{cell.name} failed (exit code {code}): see {log}", style="bold red")
-        write_json(config.file, table)
-    return config.file
+        _note_origin(table["header"], fresh)
+        _store(config.file, table)
+
+
+def _whole(folder: Path, console: Console) -> bool:
+    """Whether a cell has left results that can be read."""
+    try:
+        records.check_counts(folder / "eval.json", records.load_eval(folder / "eval.npz"))
+    except records.RecordError as error:
+        console.print(f"{error}", markup=False)
+        return False
+    return True
+
+
+def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
+    """What a finished cell left in its folder, into the table and the file beside it."""
+    folder = config.folder / cell.name
+    _keep_episodes(config.file, {cell: records.load_eval(folder / "eval.npz")})
+    _put(table, "results", cell, records.load_counts(folder / "eval.json"))
+    _drop(table, "failed", cell)
+    if (folder / "times.json").exists():
+        _put(table, "times", cell, records.load_json(folder / "times.json"))
+    _note_speed(table)
+
+
+def _note_speed(table: dict[str, Any]) -> None:
+    """Medians over the cells, into the header: samples a second, seconds of an evaluation."""
+    times = [t for cell in _cells_of(table, "times") if (t := _get(table, "times", cell))]
+    recipe, header = table["header"]["recipe"], table["header"]
+    samples = recipe["steps"] * recipe["batch_size"]
+    training = [t["training_and_selection_s"] - t.get("selection_s", 0.0) for t in times]
+    if training:
+        header["samples_per_second"] = round(samples / statistics.median(training), 1)
+        seconds = statistics.median(t["evaluation_s"] for t in times)
+        header["evaluation_seconds"] = round(seconds, 1)
+
+
+def _keep_episodes(table: Path, fresh: Mapping[Cell, Mapping[str, records.DomainRecord]]) -> None:
+    """Adds the episodes of cells to those beside the table."""
+    path = table_page.episodes_file(table)
+    try:
+        kept = records.load_eval(path) if path.exists() else {}
+    except records.RecordError as error:
+        raise records.RecordError(f"{error}: {_START_ANEW}") from error
+    for cell, by_domain in fresh.items():
+        for domain, record in by_domain.items():
+            kept[f"{cell.task}/{cell.method}/{cell.seed}/{domain}"] = record
+    records.save_eval(path, kept)
 
 
 def _announce(console: Console, cell: Cell, left: int, took: list[float]) -> None:
@@ -276,16 +361,33 @@ def _train(config: Config, log: Path) -> int:
     with log.open("a") as output:
         output.write(f"$ {' '.join(words)}\n")
         output.flush()
-        done = subprocess.run(
+        # In a group of its own: a terminal's Ctrl-C reaches it through us, and once.
+        process = subprocess.Popen(
             [sys.executable, *words[1:]],
             stdout=output,
             stderr=subprocess.STDOUT,
             env=_environment(config.data.parents[1]),
             close_fds=False,
+            process_group=0,
         )
-    if done.returncode == 130:
+        return _outcome(process)
+
+
+def _outcome(process: subprocess.Popen[bytes]) -> int:
+    """Waits for a cell. A signal is passed on: the cell saves, and goes on another time."""
+    stop = interrupts.Stop("Stopping after the running cell has saved; once more ends at once.")
+    try:
+        with stop.listening():
+            while process.poll() is None and not stop():
+                time.sleep(_POLL_S)
+            if stop():
+                process.terminate()
+            code = process.wait()
+    finally:
+        process.kill()  # nothing, if it has ended
+    if stop() or code == 130:
         raise KeyboardInterrupt
-    return done.returncode
+    return code
 
 
 def _environment(folder: Path) -> dict[str, str]:
@@ -299,15 +401,40 @@ def _environment(folder: Path) -> dict[str, str]:
     return {**ours, **os.environ}
 
 
-def _merge(table: dict[str, Any], path: Path, fresh: dict[str, Any]) -> None:
-    other = read(path, fresh)
-    for part in ("results", "failed"):
-        for cell in _cells_of(other, part):
-            if _get(table, "results", cell) is None:
-                _put(table, part, cell, _get(other, part, cell))
+def _merge(table: dict[str, Any], path: Path, fresh: dict[str, Any]) -> list[Cell]:
+    """Takes over what only the other file has; returns the cells that came with results."""
+    other, taken = read(path, fresh), []
+    for cell in _cells_of(other, "results"):
+        if _get(table, "results", cell) is None:
+            _put(table, "results", cell, _get(other, "results", cell))
+            _put(table, "times", cell, _get(other, "times", cell) or {})
+            _drop(table, "failed", cell)
+            taken.append(cell)
+    for cell in _cells_of(other, "failed"):
+        if _get(table, "results", cell) is None:
+            _put(table, "failed", cell, _get(other, "failed", cell))
+    _note_origin(table["header"], other["header"])
+    return taken
+
+
+def _note_origin(header: dict[str, Any], other: dict[str, Any]) -> None:
+    """Machines and commits that results came from, those of `other` added to `header`."""
     for name in ("machine", "commit"):
-        seen = {str(table["header"].get(name)), str(other["header"].get(name))}
-        table["header"][name] = ", ".join(sorted(seen))
+        seen = {*str(header.get(name)).split("; "), *str(other.get(name)).split("; ")}
+        header[name] = "; ".join(sorted(seen))
+
+
+def _merge_all(config: TableConfig, table: dict[str, Any], fresh: dict[str, Any]) -> None:
+    for path in config.merge:
+        taken = _merge(table, path, fresh)
+        episodes: dict[Cell, dict[str, records.DomainRecord]] = {}
+        beside = table_page.episodes_file(path)
+        for name, record in (records.load_eval(beside) if beside.exists() else {}).items():
+            task, method, seed, domain = name.split("/")
+            episodes.setdefault(Cell(task, method, int(seed)), {})[domain] = record
+        _keep_episodes(config.file, {cell: episodes[cell] for cell in taken if cell in episodes})
+    _note_speed(table)
+    _store(config.file, table)
 
 
 def _cells_of(table: dict[str, Any], part: str) -> Iterator[Cell]:
@@ -322,13 +449,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     config = tyro.cli(TableConfig, args=argv, prog="python -m palm_jax table")
     console = terminal.make_console()
     try:
-        path = run(config, console)
-    except (ConfigError, records.RecordError) as error:
+        if config.page is not None:
+            written = table_page.write(config.file, config.page)
+            console.print(f"Written: {', '.join(map(str, written))}", highlight=False)
+            return 0
+        with interrupts.raising():
+            path = run(config, console)
+    except (ConfigError, records.RecordError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         console.print("Stopped; the same command goes on with what is missing.")
         return 130
-    failed = list(_cells_of(records.load_json(path), "failed"))
+    failed = list(_cells_of(records.load_json(path), "failed")) if path.exists() else []
     console.print(f"Results: {path}" + (f"; {len(failed)} cells failed" if failed else ""))
     return 1 if failed else 0

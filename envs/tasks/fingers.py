@@ -1,4 +1,4 @@
-"""What the fingers of a hand may touch, in every task."""
+"""What may touch what, in every task: fingers and what they hold, objects and what they rest on."""
 
 from collections.abc import Sequence
 
@@ -23,3 +23,8 @@ def tip_contacts(robot: Robot, obstacles: Sequence[str]) -> tuple[Contact, ...]:
         for tip in robot.tips
         for geom in ("table", *obstacles)
     )
+
+
+def rests(first: str, second: str, friction: float = OBJECT_FRICTION) -> Contact:
+    """An object's geom on, or against, another (names)."""
+    return Contact(first, second, friction, stiff=True)

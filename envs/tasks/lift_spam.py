@@ -20,7 +20,7 @@ LIFT_SPAM = LiftTask(
     ),
     movable=("spam",),
     crop=200,
-    horizon=100,
+    horizon=120,
     body="spam",
     mocap=(),
     grasp_geom="spam_collision",

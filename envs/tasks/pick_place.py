@@ -18,8 +18,8 @@ from mujoco import mjx
 from palm_jax.envs.control import yaw_quaternion
 from palm_jax.envs.robots import Robot
 from palm_jax.envs.tasks.base import TABLE_HEIGHT, Command, Placement, Stage, Task
-from palm_jax.envs.tasks.fingers import OBJECT_FRICTION, pad_contacts, tip_contacts
-from palm_jax.envs.tasks.skills import Hold, both_touch, hold, pick, put, turn_to
+from palm_jax.envs.tasks.fingers import pad_contacts, tip_contacts
+from palm_jax.envs.tasks.skills import CLOSE_HEIGHT, Hold, both_touch, hold, pick, put, turn_to
 from palm_jax.envs.world import Contact
 
 _PICKED = 0.03  # metres that a held object has risen when the global policy takes over
@@ -51,6 +51,7 @@ class Item:
         place...
       placed_height: ...if its origin is at most this high above the table...
       placed_upright: ...and the cosine of its tilt at least this (-1: however it lies).
+      close_height: height of the TCP above the grasp (metres) at which the expert closes the hand.
     """
 
     body: str
@@ -71,6 +72,7 @@ class Item:
     placed_radius: float
     placed_height: float
     placed_upright: float = -1.0
+    close_height: float = CLOSE_HEIGHT
 
 
 def stages_of(items: Sequence[Item]) -> tuple[Stage, ...]:
@@ -114,7 +116,7 @@ class PickPlaceTask(Task):
       shuffled: whether all but the first change places at random.
       jitter: metres, per axis, by which each is moved.
       spins: which of the mocap bodies are turned at random about z.
-      supports: (geom, geom) pairs that objects rest on or bump into.
+      supports: what objects rest on or bump into.
       tip_obstacles: geoms besides the table and the items that the finger tips may push on.
       release: whether the hand must have let go of everything for success.
     """
@@ -125,15 +127,14 @@ class PickPlaceTask(Task):
     shuffled: bool
     jitter: float
     spins: tuple[bool, ...]
-    supports: tuple[tuple[str, str], ...]
+    supports: tuple[Contact, ...]
     tip_obstacles: tuple[str, ...]
     release: bool
 
     def contacts(self, robot: Robot) -> tuple[Contact, ...]:
         grasped = tuple(item.grasp_geom for item in self.items)
-        rests = [Contact(*pair, OBJECT_FRICTION, stiff=True) for pair in self.supports]
         tips = tip_contacts(robot, (*grasped, *self.tip_obstacles))
-        return (*pad_contacts(robot, grasped), *rests, *tips)
+        return (*pad_contacts(robot, grasped), *self.supports, *tips)
 
     def bind(self, model: mujoco.MjModel, robot: Robot) -> PickPlaceIds:
         left, right = (model.geom(name).id for name in robot.pads)
@@ -282,6 +283,7 @@ class PickPlaceTask(Task):
             hold=found.hold,
             bottom=rest + (grasp[2] - data.xpos[found.body, 2]),
             rise=2 * _PICKED,
+            close_height=item.close_height,
         )
 
     def _put(

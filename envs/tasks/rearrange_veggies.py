@@ -6,6 +6,7 @@ The paper gives no geometry for this task. Solved when both lie on the plate of 
 
 import math
 
+from palm_jax.envs.tasks.fingers import rests
 from palm_jax.envs.tasks.pick_place import Item, PickPlaceTask, stages_of
 
 _CARROT = Item(
@@ -63,10 +64,10 @@ REARRANGE_VEGGIES = PickPlaceTask(
     jitter=0.006,
     spins=(False, False, True, True),
     supports=(
-        ("carrot_collision", "table"),
-        ("pepper_collision", "table"),
-        ("carrot_core", "pepper_core"),
-        *((core, thing) for core in _CORES for thing in _CLUTTER),
+        rests("carrot_collision", "table"),
+        rests("pepper_collision", "table"),
+        rests("carrot_core", "pepper_core"),
+        *(rests(core, thing) for core in _CORES for thing in _CLUTTER),
     ),
     tip_obstacles=_CLUTTER,
     release=True,

@@ -11,9 +11,10 @@ from palm_jax.envs.physics import in_contact
 from palm_jax.envs.robots import Robot
 from palm_jax.envs.tasks.base import Command
 
-# The gripper closes within this of the grasp. The funnel below makes the height tell when that is:
-# what a policy must see at a glance, it learns; a conjunction of millimetres it would wait for.
-_CLOSE_HEIGHT = 0.011
+# The gripper closes within this of the grasp, or lower if the object asks for it. The funnel below
+# makes the height tell when that is: what a policy must see at a glance, it learns; a conjunction
+# of millimetres it would wait for.
+CLOSE_HEIGHT = 0.011
 _CLOSE_RADIUS = 0.013
 _CLOSE_ANGLE = 0.25
 # The funnel: how far the hand stays up for an error sideways or in yaw. Inside the radius the open
@@ -52,6 +53,7 @@ def pick(
     hold: Hold,
     bottom: jax.Array,
     rise: float,
+    close_height: float = CLOSE_HEIGHT,
 ) -> Command:
     """Go down to a grasp, close, lift straight up.
 
@@ -63,6 +65,7 @@ def pick(
       hold: of the object.
       bottom: [] world z of the grasp while the object rests.
       rise: metres to lift.
+      close_height: metres above the grasp within which the gripper closes.
     """
     hand_yaw = jnp.arctan2(tcp[1, 0], tcp[0, 0])
     lateral = jnp.linalg.norm(grasp[:2] - tcp[:2, 3])
@@ -70,7 +73,7 @@ def pick(
     arrived = (
         (lateral < _CLOSE_RADIUS)
         & (jnp.abs(turn) < _CLOSE_ANGLE)
-        & (tcp[2, 3] - grasp[2] < _CLOSE_HEIGHT)
+        & (tcp[2, 3] - grasp[2] < close_height)
     )
     closing = opening < hold.closing
     holding = closing & (opening < hold.holding)

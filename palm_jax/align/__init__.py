@@ -53,6 +53,7 @@ from palm_jax.align.lens import distort_points, undistort, undistort_points
 from palm_jax.align.overlay import tcp_overlay
 from palm_jax.align.pipeline import Aligned, AlignSpec, align, align_window, window_origin
 from palm_jax.align.proprio import matrix_from_6d, proprio, rotation_6d
+from palm_jax.align.reframe import align_like, reframe
 from palm_jax.align.textures import procedural_bank
 
 __all__ = [
@@ -67,6 +68,7 @@ __all__ = [
     "ShapeError",
     "achieved_deltas",
     "align",
+    "align_like",
     "align_window",
     "apply_delta",
     "center_crop",
@@ -85,6 +87,7 @@ __all__ = [
     "random_overlay",
     "random_perspective",
     "random_turn",
+    "reframe",
     "resize",
     "rotation_6d",
     "subpixel_crop",

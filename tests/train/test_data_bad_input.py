@@ -11,9 +11,11 @@ from typing import Any, NamedTuple
 
 import datasets
 import h5py
+import jax
 import numpy as np
 import oracles
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 from palm_jax.__main__ import main
 from palm_jax.train.data import calibration, output
@@ -320,13 +322,27 @@ def test_bad_input(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 @contextlib.contextmanager
 def files_of_at_most(size: int) -> Iterator[None]:
-    """The system refuses to let files grow beyond this, as a full disk does."""
+    """The system refuses to let files grow beyond this, as a full disk does; programs that JAX
+    compiles meanwhile would be cut short in the cache that all tests share."""
     old = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, old[1]))
     try:
-        yield
+        with _no_cache():
+            yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, old)
+
+
+@contextlib.contextmanager
+def _no_cache() -> Iterator[None]:
+    before = jax.config.jax_enable_compilation_cache
+    jax.config.update("jax_enable_compilation_cache", False)
+    compilation_cache.reset_cache()
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_compilation_cache", before)
+        compilation_cache.reset_cache()
 
 
 def align(source: Path, out: Path, *options: str) -> int:

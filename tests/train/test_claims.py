@@ -1,0 +1,84 @@
+"""The paper's claims, asked of tables whose answers are known."""
+
+import numpy as np
+import pytest
+
+from palm_jax.envs.shifts import DOMAINS
+from palm_jax.train import claims, paper
+
+METHODS = (
+    "palm", "bc", "palm-crop", "palm-overlay", "palm-aug", "palm-prop", "mirrorduo", "roviaug",
+    "arro",
+)  # fmt: skip
+
+
+def as_in_the_paper(episodes: int, *, tasks: int = 2) -> dict[str, dict[str, dict[str, dict]]]:
+    """Counts that Table I implies, the same on every task."""
+
+    def counts(method: str) -> dict[str, dict[str, int]]:
+        rates = {domain: paper.implied_success(method, domain) for domain in DOMAINS}
+        return {
+            domain: {"successes": round(rate * episodes), "episodes": episodes, "nan": 0}
+            for domain, rate in rates.items()
+            if rate is not None
+        }
+
+    return {f"task{i}": {method: counts(method) for method in METHODS} for i in range(tasks)}
+
+
+def verdicts(rows: claims.Rows) -> dict[str, str]:
+    return {claim.name: claim.verdict for claim in claims.judge(rows)}
+
+
+def test_the_papers_own_numbers_bear_out_its_claims() -> None:
+    found = verdicts(as_in_the_paper(20_000))
+    assert found == {f"C{i}": "holds" for i in range(1, 10)}
+
+
+def test_few_episodes_decide_nothing() -> None:
+    found = verdicts(as_in_the_paper(4, tasks=1))
+    assert "does not hold" not in found.values()
+    assert found["C2"] == "undecided" and found["C8"] == "undecided"
+
+
+def test_the_reverse_is_seen() -> None:
+    rows = as_in_the_paper(20_000)
+    for row in rows.values():
+        row["palm"], row["bc"] = row["bc"], row["palm"]
+    found = verdicts(rows)
+    assert found["C1"] == found["C2"] == "does not hold"
+
+
+def test_a_method_that_a_task_lacks_is_not_judged() -> None:
+    rows = as_in_the_paper(100)
+    del rows["task1"]["arro"]
+    found = verdicts(rows)
+    assert {name for name, verdict in found.items() if verdict == "not run"} == {"C1", "C7", "C9"}
+
+
+@pytest.mark.parametrize(("good", "total"), [(4_000, 10_000), (9_000, 10_000)])
+def test_intervals_of_many_episodes_are_those_of_the_normal_law(good: int, total: int) -> None:
+    entry = {"successes": good, "episodes": total, "nan": 0}
+    posterior = claims.Posterior({"t": {"palm": dict.fromkeys(DOMAINS, entry)}})
+    found = claims.estimate(posterior.success("palm"))
+    p = good / total
+    half = 1.96 * np.sqrt(p * (1 - p) / total)
+    np.testing.assert_allclose(found, [p, p - half, p + half], atol=6e-4)
+
+
+def test_a_task_that_is_not_learned_is_left_out_of_the_losses_alone() -> None:
+    rows = as_in_the_paper(100)
+    for entry in rows["task1"]["bc"].values():
+        entry["successes"] = 0
+    posterior = claims.Posterior(rows)
+    assert posterior.tasks("bc") == ["task0"] and len(posterior.tasks("palm")) == 2
+    assert posterior.success("bc")[0] == pytest.approx(0.52 / 2)
+    assert posterior.loss("bc", "W")[0] == pytest.approx(0.40, abs=0.02)
+
+
+def test_seeds_are_summed() -> None:
+    one = {"in_domain": {"successes": 3, "episodes": 10, "nan": 1}}
+    two = {"in_domain": {"successes": 4, "episodes": 10, "nan": 0}}
+    total = claims.summed({"0": one, "1": two})
+    assert total == {"in_domain": {"successes": 7, "episodes": 20, "nan": 1}}
+    assert one["in_domain"]["successes"] == 3

@@ -1,0 +1,114 @@
+"""The page of a table: every number of the file is on it, and nothing around it is touched."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from palm_jax.envs.shifts import DOMAINS
+from palm_jax.train import config, records, table, table_page
+from palm_jax.train.table import TableConfig
+
+METHODS = ("palm", "bc")
+
+
+def record(generator: np.random.Generator, episodes: int) -> records.DomainRecord:
+    return records.DomainRecord(
+        success=generator.random(episodes) < 0.7,
+        nan=np.zeros(episodes, bool),
+        object_xy=generator.uniform((0.1, -0.3), (0.4, 0.3), (episodes, 2)).astype(np.float32),
+        camera_angle=generator.uniform(-0.5, 0.5, episodes).astype(np.float32),
+        length=np.full(episodes, 50, np.int32),
+        draws=np.ones(episodes, np.int32),
+    )
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A table of two methods on two tasks, PALM with two seeds, and its episodes."""
+    folder = tmp_path_factory.mktemp("table")
+    generator = np.random.default_rng(0)
+    asked = TableConfig(preset="quick", tasks=("lift_lid", "insert_peg"), methods=METHODS)
+    content: dict[str, Any] = {"header": table.header(asked), "results": {}, "failed": {}}
+    episodes = {}
+    for task in asked.tasks:
+        for method, seed in (("palm", "0"), ("palm", "1"), ("bc", "0")):
+            found = {domain: record(generator, 20) for domain in DOMAINS}
+            row = content["results"].setdefault(task, {}).setdefault(method, {})
+            row[seed] = records.counts(found)
+            episodes |= {f"{task}/{method}/{seed}/{domain}": r for domain, r in found.items()}
+    content["failed"] = {"lift_lid": {"arro": {"0": "arro.log"}}}
+    path = folder / "table.json"
+    path.write_text(json.dumps(content))
+    records.save_eval(table_page.episodes_file(path), episodes)
+    return path
+
+
+@pytest.fixture(scope="module")
+def page(made: Path) -> str:
+    path = made.parent / "results.md"
+    begin, end = table_page.markers("quick")
+    path.write_text(f"# Before\n\n{begin}\nstale words\n{end}\n\nAfter.\n")
+    assert table.main(["--json", str(made), "--page", str(path)]) == 0
+    return path.read_text()
+
+
+def test_what_is_around_stays(page: str) -> None:
+    assert (
+        page.startswith("# Before\n") and page.endswith("\nAfter.\n") and "stale words" not in page
+    )
+
+
+def test_every_policy_has_its_counts(page: str, made: Path) -> None:
+    for row in json.loads(made.read_text())["results"].values():
+        for seeds in row.values():
+            for counts in seeds.values():
+                cells = [f"{counts[d]['successes']}/20" for d in DOMAINS]
+                assert re.search(r"\| " + cells[0] + r" \([^|]*\| " + " | ".join(cells[1:]), page)
+
+
+def test_the_command_beside_a_policy_is_its_own(page: str) -> None:
+    commands = re.findall(r"`python -m palm_jax\.train ([^`]*)`", page)
+    parsed = [config.parse(words.split()) for words in commands]
+    assert {(c.task, *c.method, c.seed) for c in parsed} == {
+        (task, method, seed)
+        for task in ("lift_lid", "insert_peg")
+        for method, seed in (("palm", 0), ("palm", 1), ("bc", 0))
+    }
+    wanted = table.cell_config(TableConfig(preset="quick"), table.Cell("lift_lid", "bc", 0))
+    same = next(c for c in parsed if c.task == "lift_lid" and c.method == ("bc",))
+    for name in ("demo_seed", "eval_seed", "domains", "steps", "sweep", "scenes"):
+        assert getattr(same, name) == getattr(wanted, name)
+
+
+def test_what_was_not_run_is_said(page: str) -> None:
+    line = next(line for line in page.splitlines() if line.startswith("Not complete: "))
+    assert "PALM (Lift Spam, Rearrange Veggies)" in line and "ARRO (every task)" in line
+
+
+def test_what_failed_is_said(page: str) -> None:
+    assert "Failed, and in no number above: Lift Lid, ARRO, seed 0." in page
+
+
+def test_the_figures_are_there(page: str, made: Path) -> None:
+    figures = re.findall(r"!\[[^]]*\]\(([^)]*)\)", page)
+    assert len(figures) == 4
+    assert all((made.parent / figure).stat().st_size > 1000 for figure in figures)
+
+
+def test_episodes_of_seeds_are_joined(made: Path) -> None:
+    found = table_page.load_episodes(table_page.episodes_file(made))
+    assert found["lift_lid"]["palm"]["workspace"].episodes == 40
+    assert found["lift_lid"]["bc"]["workspace"].episodes == 20
+
+
+def test_a_page_without_markers_is_not_touched(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "page.md"
+    path.write_text("# Mine\n")
+    assert table.main(["--json", str(made), "--page", str(path)]) == 2
+    assert "markers" in capsys.readouterr().err and path.read_text() == "# Mine\n"

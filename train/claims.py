@@ -1,0 +1,268 @@
+"""What the paper claims of its main table, asked of a table of ours.
+
+Every question is a difference (or several) that the claim says is positive. Success rates have
+Beta posteriors under Jeffreys' prior, independent over cells; a claim holds when the central 95 %
+of every difference lies above zero, does not when that of any lies below, and is undecided
+otherwise. Scenes are what is resampled: the spread between training seeds is not in it.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from palm_jax.train import paper, stats
+
+Counts = Mapping[str, Mapping[str, int]]  # domain -> successes, episodes, nan
+Rows = Mapping[str, Mapping[str, Counts]]  # task -> method -> counts, seeds summed
+
+LEAST_IN_DOMAIN = 0.1
+"""A policy that solves less in-domain has nothing to lose: that task is left out of its losses."""
+
+_DRAWS = 4000
+_AXES = ("W", "V", "E")
+
+
+class Estimate(NamedTuple):
+    """A quantity with its central 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+class Posterior:
+    """Success and loss of the methods of a table, as draws.
+
+    Args:
+      rows: task -> method -> domain -> counts; every method on the same tasks.
+      seed: of the draws.
+    """
+
+    def __init__(self, rows: Rows, *, seed: int = 0) -> None:
+        self._rows = rows
+        self._generator = np.random.default_rng(seed)
+        self._draws: dict[tuple[str, str, str], np.ndarray] = {}
+
+    @property
+    def methods(self) -> list[str]:
+        """Those that every task has."""
+        shared = [set(row) for row in self._rows.values()]
+        return paper.ordered_methods(sorted(set.intersection(*shared))) if shared else []
+
+    def _rate(self, task: str, method: str, key: str) -> tuple[float, np.ndarray]:
+        """Share solved in one cell, and draws [D] of its true value."""
+        domain = next(d for d in self._rows[task][method] if paper.domain_key(d) == key)
+        entry = self._rows[task][method][domain]
+        good, total = entry["successes"], entry["episodes"]
+        where = (task, method, key)
+        if where not in self._draws:
+            beta = self._generator.beta(good + 0.5, total - good + 0.5, _DRAWS)
+            self._draws[where] = beta
+        return good / total, self._draws[where]
+
+    def tasks(self, method: str) -> list[str]:
+        """Tasks that the method's losses are means over, see `LEAST_IN_DOMAIN`."""
+        return [t for t in self._rows if self._rate(t, method, "ID")[0] >= LEAST_IN_DOMAIN]
+
+    def success(self, method: str) -> tuple[float, np.ndarray]:
+        """In-domain success, mean over all tasks: value, draws [D]."""
+        return _mean([self._rate(task, method, "ID") for task in self._rows])
+
+    def loss(self, method: str, *keys: str) -> tuple[float, np.ndarray]:
+        """1 - success / in-domain success, mean over domains (keys as in `paper`) and tasks."""
+        parts = []
+        for task in self.tasks(method):
+            base, base_draws = self._rate(task, method, "ID")
+            for key in keys:
+                rate, draws = self._rate(task, method, key)
+                parts.append((1 - rate / base, 1 - draws / base_draws))
+        return _mean(parts)
+
+    def mean_loss(self, method: str) -> tuple[float, np.ndarray]:
+        """Over the seven shifted domains."""
+        return self.loss(method, *paper.OOD_DOMAINS)
+
+
+def _mean(parts: Sequence[tuple[float, np.ndarray]]) -> tuple[float, np.ndarray]:
+    if not parts:
+        return float("nan"), np.full(_DRAWS, np.nan)
+    values, draws = zip(*parts, strict=True)
+    return float(np.mean(values)), np.mean(draws, axis=0)
+
+
+def estimate(found: tuple[float, np.ndarray]) -> Estimate:
+    """Value and interval of what a `Posterior` returns."""
+    value, draws = found
+    low, high = np.percentile(draws, [2.5, 97.5])
+    return Estimate(value, float(low), float(high))
+
+
+class Question(NamedTuple):
+    """One difference of a claim."""
+
+    text: str
+    difference: Estimate  # above zero: as claimed
+
+
+class Claim(NamedTuple):
+    """A claim of the paper and what our table says of it."""
+
+    name: str
+    text: str
+    verdict: str  # "holds", "does not hold", "undecided" or "not run"
+    questions: tuple[Question, ...]
+
+
+Ask = Callable[[Posterior], list[Question]]
+
+
+def _minus(
+    text: str, more: tuple[float, np.ndarray], less: tuple[float, np.ndarray], *, by: float = 0.0
+) -> Question:
+    return Question(text, estimate((more[0] - less[0] - by, more[1] - less[1] - by)))
+
+
+def _label(method: str) -> str:
+    return paper.method_label(method)
+
+
+_BASELINES = ("bc", "mirrorduo", "roviaug", "arro")
+_BARELY = 0.15  # "barely affected": a loss larger than PALM's by less than this
+_FAILS = 0.3  # "fails": a loss of at least this
+
+
+def _c1(p: Posterior) -> list[Question]:
+    palm = p.mean_loss("palm")
+    return [_minus(f"mean loss, {_label(b)} - PALM", p.mean_loss(b), palm) for b in _BASELINES]
+
+
+def _c2(p: Posterior) -> list[Question]:
+    return [_minus("in-domain success, PALM - BC", p.success("palm"), p.success("bc"))]
+
+
+def _c3(p: Posterior) -> list[Question]:
+    palm = p.mean_loss("palm")
+    parts = ("palm-crop", "palm-prop")
+    return [_minus(f"mean loss, {_label(m)} - PALM", p.mean_loss(m), palm) for m in parts]
+
+
+def _c4(p: Posterior) -> list[Question]:
+    crop, prop = "palm-crop", "palm-prop"
+    return [
+        _minus("loss in E, w/o crop - w/o aligned proprio", p.loss(crop, "E"), p.loss(prop, "E")),
+        _minus("loss in W, w/o aligned proprio - PALM", p.loss(prop, "W"), p.loss("palm", "W")),
+        _minus("loss in V, w/o aligned proprio - PALM", p.loss(prop, "V"), p.loss("palm", "V")),
+    ]
+
+
+def _c5(p: Posterior) -> list[Question]:
+    questions = []
+    for method in ("palm-overlay", "palm-aug"):
+        name = _label(method).removeprefix("PALM ")
+        both, palm = p.loss(method, "W", "V"), p.loss("palm", "W", "V")
+        text = f"{_BARELY} - (loss in W and V, {name} - PALM)"
+        rest = (_BARELY - (both[0] - palm[0]), _BARELY - (both[1] - palm[1]))
+        questions.append(Question(text, estimate(rest)))
+        embodied = (p.loss(method, "E"), p.loss("palm", "E"))
+        questions.append(_minus(f"loss in E, {name} - PALM", *embodied))
+    return questions
+
+
+def _c6(p: Posterior) -> list[Question]:
+    nothing = (0.0, np.zeros(_DRAWS))
+    return [
+        _minus(f"loss of BC in {key} - {_FAILS}", p.loss("bc", key), nothing, by=_FAILS)
+        for key in ("W", "V")
+    ]
+
+
+_OWN = (("mirrorduo", "W"), ("roviaug", "V"), ("arro", "E"))
+
+
+def _c7(p: Posterior) -> list[Question]:
+    questions = [
+        _minus(f"loss in {key}, BC - {_label(m)}", p.loss("bc", key), p.loss(m, key))
+        for m, key in _OWN
+    ]
+    for method, _ in _OWN:
+        apart = [(p.loss(method, key), p.loss("palm", key)) for key in paper.OOD_DOMAINS]
+        value = min(theirs[0] - ours[0] for theirs, ours in apart)
+        draws = np.min([theirs[1] - ours[1] for theirs, ours in apart], axis=0)
+        text = f"loss, {_label(method)} - PALM, the smallest of seven domains"
+        questions.append(Question(text, estimate((value, draws))))
+    return questions
+
+
+def _c8(p: Posterior) -> list[Question]:
+    return [_minus("in-domain success, BC - RoVi-Aug", p.success("bc"), p.success("roviaug"))]
+
+
+def _c9(p: Posterior) -> list[Question]:
+    palm = p.loss("palm", "E")
+    return [
+        _minus("loss in E, ARRO - PALM", p.loss("arro", "E"), palm),
+        _minus("loss in E, w/o overlay - PALM", p.loss("palm-overlay", "E"), palm),
+    ]
+
+
+_CLAIMS: dict[str, tuple[str, tuple[str, ...], Ask]] = {
+    "C1": ("PALM loses far less out of distribution than any baseline", _BASELINES, _c1),
+    "C2": ("PALM is better than BC in-domain, too", ("bc",), _c2),
+    "C3": ("Both are needed: the crop and the aligned proprioception",
+           ("palm-crop", "palm-prop"), _c3),
+    "C4": ("The crop matters most for embodiment, the proprioception for workspace and viewpoint",
+           ("palm-crop", "palm-prop"), _c4),
+    "C5": ("Overlay and augmentation barely matter for workspace and viewpoint, but for embodiment",
+           ("palm-overlay", "palm-aug"), _c5),
+    "C6": ("BC fails outside of the training workspace and under turned cameras", ("bc",), _c6),
+    "C7": ("Each baseline improves on BC on its own axis, none matches PALM anywhere",
+           _BASELINES, _c7),
+    "C8": ("RoVi-Aug's reconstructed views cost it success in-domain", ("bc", "roviaug"), _c8),
+    "C9": ("The overlay tells more of the embodiment than masking can",
+           ("arro", "palm-overlay"), _c9),
+}  # fmt: skip
+
+
+def judge(rows: Rows) -> list[Claim]:
+    """The paper's claims C1 to C9 of its main table.
+
+    Args:
+      rows: task -> method -> domain -> counts, seeds summed. A claim about a method that is not on
+        every task is "not run".
+    """
+    posterior = Posterior(rows)
+    claims = []
+    for name, (text, needed, ask) in _CLAIMS.items():
+        if not {"palm", *needed} <= set(posterior.methods):
+            claims.append(Claim(name, text, "not run", ()))
+            continue
+        questions = tuple(ask(posterior))
+        claims.append(Claim(name, text, _verdict(questions), questions))
+    return claims
+
+
+def _verdict(questions: Sequence[Question]) -> str:
+    if all(question.difference.low > 0 for question in questions):
+        return "holds"
+    if any(question.difference.high < 0 for question in questions):
+        return "does not hold"
+    return "undecided"
+
+
+def summed(seeds: Mapping[str, Counts]) -> dict[str, dict[str, int]]:
+    """Counts of one method on one task, over its seeds."""
+    total: dict[str, dict[str, int]] = {}
+    for counts in seeds.values():
+        for domain, entry in counts.items():
+            so_far = total.setdefault(domain, dict.fromkeys(entry, 0))
+            for name, value in entry.items():
+                so_far[name] += value
+    return total
+
+
+def loss(counts: Counts, key: str) -> float:
+    """1 - success / in-domain success of one policy in one domain, NaN without the latter."""
+    by_key = {paper.domain_key(domain): entry for domain, entry in counts.items()}
+    rates = [by_key[k]["successes"] / by_key[k]["episodes"] for k in (key, "ID")]
+    return float(stats.degradation(*rates))

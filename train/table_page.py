@@ -1,0 +1,244 @@
+"""`python -m palm_jax table --page PAGE.md`: a table's file as Markdown and figures, the paper's
+numbers beside ours. Everything comes from the file and the episodes beside it; nothing is run."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from palm_jax.train import claims, config, figures, grids, paper, records, stats
+from palm_jax.train.metrics import write_atomic
+from palm_jax.train.records import DomainRecord, RecordError
+from palm_jax.train.runs import regions_of
+
+Episodes = dict[str, dict[str, dict[str, DomainRecord]]]  # task -> method -> domain
+
+_COLUMNS = tuple(paper.DOMAINS)
+
+PAPER_TASKS = ("lift_lid", "lift_spam", "insert_peg", "rearrange_veggies")
+PAPER_METHODS = (
+    "palm", "bc", "palm-crop", "palm-overlay", "palm-aug", "palm-prop", "mirrorduo", "roviaug",
+    "arro",
+)  # fmt: skip
+"""Rows and columns of the paper's table."""
+
+
+def markers(preset: str) -> tuple[str, str]:
+    """The lines of the page that the text of this preset stands between."""
+    return f"<!-- table {preset}: generated -->", f"<!-- table {preset}: end -->"
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _number(value: float) -> str:
+    return "-" if value != value else f"{value:.2f}".replace("-0.00", "0.00")
+
+
+def _interval(found: claims.Estimate) -> str:
+    if found.value != found.value:
+        return "-"
+    return f"{_number(found.value)} ({_number(found.low)} to {_number(found.high)})"
+
+
+def rows_of(table: Mapping[str, Any]) -> dict[str, dict[str, dict[str, dict[str, int]]]]:
+    """task -> method -> domain -> counts, seeds summed."""
+    return {
+        task: {method: claims.summed(seeds) for method, seeds in row.items() if seeds}
+        for task, row in table["results"].items()
+    }
+
+
+# -- parts of the page -----------------------------------------------------------------------------
+
+
+def _conditions(header: Mapping[str, Any]) -> str:
+    recipe = header["recipe"]
+    versions = ", ".join(f"{name} {version}" for name, version in header["versions"].items())
+    return (
+        f"{recipe['demos']} demonstrations of the {recipe['robot']} a task, {recipe['steps']} "
+        f"updates of {recipe['batch_size']} samples, {recipe['image_size']}-pixel images, width "
+        f"{recipe['width']}, {recipe['scenes']} scenes a domain, the same for every method; in "
+        f"domains with E the {recipe['other_robot']} acts. {header['machine']}; {versions}; commit "
+        f"{header['commit']}."
+    )
+
+
+def _means(rows: claims.Rows) -> str:
+    """Ours above the paper's, a pair of lines for each method that every task has."""
+    posterior, body = claims.Posterior(rows), []
+    for method in posterior.methods:
+        losses = [claims.estimate(posterior.loss(method, key)) for key in paper.OOD_DOMAINS]
+        mean = claims.estimate(posterior.mean_loss(method))
+        ours = [claims.estimate(posterior.success(method)), *losses, mean]
+        left_out = len(rows) - len(posterior.tasks(method))
+        name = paper.method_label(method) + (f" ({left_out} tasks left out)" if left_out else "")
+        body.append([name, *map(_interval, ours)])
+        if (base := paper.in_domain_success(method)) is not None:
+            theirs = [base, *(paper.degradation(method, key) for key in paper.OOD_DOMAINS)]
+            theirs.append(paper.average_degradation(method))
+            body.append(["- the paper", *(_number(v) for v in theirs if v is not None)])
+    labels = [paper.domain_label(key) for key in paper.OOD_DOMAINS]
+    return markdown(["", "success ID", *(f"loss {label}" for label in labels), "mean loss"], body)
+
+
+def _claims(rows: claims.Rows) -> str:
+    body = []
+    for claim in claims.judge(rows):
+        numbers = "; ".join(f"{q.text}: {_interval(q.difference)}" for q in claim.questions)
+        body.append([claim.name, claim.text, f"**{claim.verdict}**", numbers or "-"])
+    return markdown(["", "the paper's claim", "here", "differences, above zero as claimed"], body)
+
+
+def _task(header: Mapping[str, Any], task: str, row: Mapping[str, Any]) -> str:
+    """Every policy of a task: what it solved, and the command that repeats it."""
+    body = []
+    for method in paper.ordered_methods([name for name, seeds in row.items() if seeds]):
+        for seed, counts in sorted(row[method].items(), key=lambda item: int(item[0])):
+            body.append(_policy(header, task, method, seed, counts))
+    labels = [paper.domain_label(key) for key in _COLUMNS]
+    return markdown(["method", "seed", *labels, "mean loss", "command"], body)
+
+
+def _policy(
+    header: Mapping[str, Any], task: str, method: str, seed: str, counts: claims.Counts
+) -> list[str]:
+    by_key = {paper.domain_key(domain): entry for domain, entry in counts.items()}
+    cells = [f"{by_key[key]['successes']}/{by_key[key]['episodes']}" for key in _COLUMNS]
+    base = by_key["ID"]
+    low, high = stats.wilson_interval(base["successes"], base["episodes"])
+    cells[0] += f" ({100 * low:.0f} to {100 * high:.0f} %)"
+    losses = [claims.loss(counts, key) for key in paper.OOD_DOMAINS]
+    nan = sum(entry["nan"] for entry in counts.values())
+    name = paper.method_label(method) + (f", {nan} diverged" if nan else "")
+    command = (
+        f"`python -m palm_jax.train --preset {header['preset']} --task {task} --method {method} "
+        f"--seed {seed} --no-sweep`"
+    )
+    return [name, seed, *cells, _number(sum(losses) / len(losses)), command]
+
+
+def _missing(table: Mapping[str, Any]) -> list[str]:
+    """Methods of the paper's table, each with the tasks on which it has no policy yet."""
+    lines = []
+    for method in PAPER_METHODS:
+        tasks = [
+            paper.task_label(task)
+            for task in PAPER_TASKS
+            if not table["results"].get(task, {}).get(method)
+        ]
+        if tasks:
+            where = "every task" if len(tasks) == len(PAPER_TASKS) else ", ".join(tasks)
+            lines.append(f"{paper.method_label(method)} ({where})")
+    return lines
+
+
+def _failed(table: Mapping[str, Any]) -> Iterator[str]:
+    for task, row in table.get("failed", {}).items():
+        for method, seeds in row.items():
+            for seed in seeds:
+                yield f"{paper.task_label(task)}, {paper.method_label(method)}, seed {seed}"
+
+
+def text(table: Mapping[str, Any], drawn: Mapping[str, Sequence[str]]) -> str:
+    """What stands between the markers.
+
+    Args:
+      table: content of the JSON file.
+      drawn: task -> paths of its figures, relative to the page.
+    """
+    rows, header = rows_of(table), table["header"]
+    parts = [f"## The main table, preset `{header['preset']}`", _conditions(header)]
+    parts += ["### Means over the tasks", _means(rows), "### The claims", _claims(rows)]
+    missing, failed = _missing(table), list(_failed(table))
+    if missing:
+        parts.insert(1, f"Not complete: {'; '.join(missing)} not run yet.")
+    if failed:
+        parts.append(f"Failed, and in no number above: {'; '.join(failed)}.")
+    for task, row in table["results"].items():
+        parts += [f"### {paper.task_label(task)}", _task(header, task, row)]
+        parts += [f"![{Path(path).stem}]({path})" for path in drawn.get(task, ())]
+    return "\n\n".join(parts)
+
+
+# -- figures ---------------------------------------------------------------------------------------
+
+
+def episodes_file(table: Path) -> Path:
+    """Where the episodes of a table's file are kept."""
+    return table.with_suffix(".npz")
+
+
+def load_episodes(path: Path) -> Episodes:
+    """Every episode, seeds joined; empty where there is no file."""
+    found: Episodes = {}
+    if not path.exists():
+        return found
+    parts: dict[tuple[str, str, str], list[DomainRecord]] = {}
+    for name, record in records.load_eval(path).items():
+        task, method, _, domain = name.split("/")
+        parts.setdefault((task, method, domain), []).append(record)
+    for (task, method, domain), several in parts.items():
+        by_method = found.setdefault(task, {}).setdefault(method, {})
+        by_method[domain] = records.joined(several)
+    return found
+
+
+def draw(task: str, methods: Mapping[str, Mapping[str, DomainRecord]], folder: Path) -> list[Path]:
+    """Figures of one task: where BC and PALM succeed, and a heatmap of every method."""
+    regions = regions_of({"task": task})
+    pair = {name: methods[name] for name in ("bc", "palm") if name in methods}
+    made = []
+    if pair:
+        made.append(folder / f"samples_{task}.png")
+        figures.save(figures.sample_distribution(pair, regions), made[-1])
+    maps = {
+        name: grids.grid_of_records(
+            [methods[name]["in_domain"], methods[name]["workspace"]], regions
+        )
+        for name in paper.ordered_methods(list(methods))
+    }
+    if maps:
+        made.append(folder / f"heatmaps_{task}.png")
+        figures.save(figures.heatmaps(maps, regions), made[-1], dpi=110)
+    return made
+
+
+def write(table_file: Path, page: Path) -> list[Path]:
+    """Writes the table into the page, between its markers, and the figures beside it.
+
+    Returns:
+      the files written, the page first.
+
+    Raises:
+      RecordError: the table or the page cannot be used; the message says why.
+    """
+    table = records.load_json(table_file)
+    preset = table["header"]["preset"]
+    if preset not in config.PRESETS:
+        raise RecordError(
+            f"{table_file}: preset {preset!r} is none; expected one of {config.PRESETS}"
+        )
+    drawn = {
+        task: draw(task, methods, page.parent / "images" / f"table_{preset}")
+        for task, methods in load_episodes(episodes_file(table_file)).items()
+    }
+    relative = {t: [str(path.relative_to(page.parent)) for path in ps] for t, ps in drawn.items()}
+    before, after = _around(page, preset)
+    begin, end = markers(preset)
+    content = f"{before}{begin}\n\n{text(table, relative)}\n\n{end}{after}"
+    write_atomic(page, content.encode())
+    return [page, *(path for paths in drawn.values() for path in paths)]
+
+
+def _around(page: Path, preset: str) -> tuple[str, str]:
+    begin, end = markers(preset)
+    if not page.exists():
+        return "# Results\n\n", "\n"
+    before, found, rest = page.read_text().partition(begin)
+    _, closed, after = rest.partition(end)
+    if not found or not closed:
+        raise RecordError(f"{page}: expected the markers {begin!r} and {end!r}; add them")
+    return before, after
