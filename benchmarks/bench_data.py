@@ -5,8 +5,9 @@ frames read and decompressed, aligned, compressed (gzip, level 1), checksummed a
 disk. The look for flipped images is left out: it takes the same seconds whatever the size of the
 file. The files are in the system's cache when they are read.
 
-`layouts`: for HDF5 the images as they are, or a frame a chunk compressed by gzip or lzf; an mp4
-(H.264) of a LeRobot set, where PyAV and pyarrow are installed. `peak_mb` is the memory of the
+`layouts`: for HDF5 the images as they are (raw), or a frame a chunk compressed by gzip or lzf; raw
+with lens coefficients, so that frames are undistorted first; an mp4 (H.264) of a LeRobot set, where
+PyAV and pyarrow are installed. `peak_mb` is the memory of the
 process.
 """
 
@@ -39,7 +40,7 @@ def run(*, repeats: int = 3) -> dict[str, Any]:
     """`file_frames_per_second` of uncompressed HDF5: the median."""
     rows = {}
     with tempfile.TemporaryDirectory() as folder:
-        for layout in (*LAYOUTS, "mp4"):
+        for layout in (*LAYOUTS, "lens", "mp4"):
             if layout == "mp4" and not all(map(importlib.util.find_spec, ("av", "pyarrow"))):
                 continue
             rows[layout] = _measured(Path(folder) / layout, layout, repeats)
@@ -56,13 +57,14 @@ def run(*, repeats: int = 3) -> dict[str, Any]:
 def _measured(folder: Path, layout: str, repeats: int) -> dict[str, Any]:
     folder.mkdir()
     path = folder / "recording.hdf5"
-    record(path, "raw" if layout == "mp4" else layout)
+    record(path, layout if layout in LAYOUTS else "raw")
+    dist = (-0.1, 0.02, 0.001, 0.001) if layout == "lens" else None
     if layout == "mp4":
         path = _as_video(path, folder / "set")
     seconds, cpu = [], []
     for _ in range(1 + repeats):
         start, before = time.perf_counter(), time.process_time()
-        with data.open_recording(path, calibration(), camera="front") as recording:
+        with data.open_recording(path, calibration(dist), camera="front") as recording:
             spec = data.paper_spec(FRAME)
             options = data.Options(format="robomimic")
             data.align_file(recording, spec, folder / "new.hdf5", options, trust=True)
@@ -80,13 +82,14 @@ def _measured(folder: Path, layout: str, repeats: int) -> dict[str, Any]:
     }
 
 
-def calibration() -> data.Calibration:
+def calibration(dist: tuple[float, ...] | None = None) -> data.Calibration:
     """A camera one metre and a half above the workspace, looking down."""
     focal = FRAME / 2 / np.tan(np.radians(FOVY) / 2)
     K = np.array([[focal, 0, FRAME / 2], [0, focal, FRAME / 2], [0, 0, 1]])
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = 1.5
-    return data.Calibration({"front": data.CameraCalibration("front", K, FRAME, FRAME, pose)})
+    camera = data.CameraCalibration("front", K, FRAME, FRAME, pose, dist)
+    return data.Calibration({"front": camera})
 
 
 def pictures() -> np.ndarray:

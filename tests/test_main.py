@@ -29,7 +29,7 @@ def verb(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 def test_help_lists_every_verb(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(words) == 0
     out = capsys.readouterr().out
-    for name in ("train", "sweep", "report", "show", "serve", "export", "bench"):
+    for name in ("train", "sweep", "report", "data", "show", "serve", "export", "bench"):
         assert f"\n  {name} " in out
 
 

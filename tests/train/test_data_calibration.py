@@ -25,6 +25,7 @@ from palm_jax.train.data.errors import (
     ImageSizeError,
     PoseDataError,
 )
+from palm_jax.train.data.recording import open_recording
 from palm_jax.train.data.source import open_source
 
 POSE = oracles.looking_at(np.array([1.0, -0.4, 1.5]), np.array([0.2, 0.1, 0.8]))
@@ -434,6 +435,19 @@ def test_changing_a_calibration(tmp_path: Path) -> None:
     assert changed.robot.opening == "grip" and changed.robot.closed == 1.0
     kept = commands.make_calibration(options("palm", file=path))
     assert kept.to_json() == calib.load(path).to_json()
+
+
+def test_the_other_orientation_that_robosuite_writes() -> None:
+    """`robot0_eef_quat_site` is that of the grip site, a quarter turn from the hand's."""
+    other = datasets.robosuite(
+        pose="robot0_eef_pos+robot0_eef_quat_site", rotation="quat_xyzw", tcp_turn=90.0
+    )
+    with (
+        open_recording(datasets.LIFT, datasets.robosuite()) as first,
+        open_recording(datasets.LIFT, other) as second,
+    ):
+        expected, got = first.trajectory("demo_1").tcp, second.trajectory("demo_1").tcp
+    np.testing.assert_allclose(got, expected, atol=1e-3)
 
 
 def test_sources_name_their_keys_and_columns() -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import datasets
@@ -13,7 +14,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from palm_jax.__main__ import main
-from palm_jax.train.data import aligning, calibration, check, commands, motion
+from palm_jax.train.data import aligning, calibration, check, commands, errors, motion
 from palm_jax.train.data.calibration import Calibration
 from palm_jax.train.data.recording import Recording, open_recording
 
@@ -175,7 +176,7 @@ def drawn(recording: Recording, path: Path) -> Image.Image:
 def test_the_sheet_shows_the_overlay_where_the_hand_is(tmp_path: Path) -> None:
     with open_recording(datasets.CAN, datasets.robosuite(datasets.CAN)) as recording:
         picture = drawn(recording, tmp_path / "good.png")
-        name, index = check._chosen(recording)[0]
+        name, index = check._chosen(recording, check.PANELS)[0]
     panel = check.PANEL + check.CAPTION
     assert picture.size == (4 * check.PANEL, check.CAPTION + 3 * panel)
     with h5py.File(datasets.CAN) as file:
@@ -184,7 +185,7 @@ def test_the_sheet_shows_the_overlay_where_the_hand_is(tmp_path: Path) -> None:
     assert (dot == 255).all()
     with open_recording(datasets.CAN, with_camera(datasets.CAN, flip="lr")) as recording:
         both = drawn(recording, tmp_path / "flipped.png")
-    assert both.size == (picture.width, 2 * picture.height)
+    assert both.size == (picture.width, 2 * (check.CAPTION + 2 * panel))
 
 
 def test_the_sheet_says_what_is_behind(tmp_path: Path) -> None:
@@ -227,6 +228,24 @@ def test_ten_minutes(
     assert not Path("b.hdf5").exists()
     assert run("repair", "a.hdf5", "--out", "c.hdf5") == 0
     assert "1 episodes written: c.hdf5" in capsys.readouterr().out
+
+
+def test_the_code_of_the_page_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = (datasets.SAMPLES.parents[1] / "docs" / "your_data.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    names = {
+        "path": datasets.CAN,
+        "calibration_path": calibration.save(
+            datasets.robosuite(datasets.CAN), tmp_path / "calibration.json"
+        ),
+    }
+    exec(compile(code, "your_data.md", "exec"), names)
+    assert capsys.readouterr().out == "demo_0 (31, 84, 84, 3) (31, 8) (31, 10)\n"
+    for command in commands.COMMANDS:
+        assert f"palm_jax data {command} " in page
+    for error in (value for value in vars(errors).values() if isinstance(value, type)):
+        if issubclass(error, errors.DataError) and error is not errors.DataError:
+            assert f"`{error.__name__}`" in page
 
 
 def test_options_of_align() -> None:

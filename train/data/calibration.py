@@ -20,7 +20,7 @@
 - `by_episode` holds the camera's pose in the episodes in which it was another one.
 - `T_ee_tcp` is the TCP in the frame of the recorded poses: origin between the finger pads, z the
   approach direction, y the opening axis (docs/conventions.md).
-- `robot` may be absent or have nulls where the keys are known ones (`episodes.KNOWN_POSES`).
+- `robot` may be absent or have nulls where the keys are known ones (`recording.KNOWN_POSES`).
 """
 
 from __future__ import annotations

@@ -181,11 +181,12 @@ def sheet(recording: Recording, report: Report, spec: AlignSpec, path: Path) -> 
     """
     camera = recording.camera
     title = f"{recording.source.path.name}, camera {camera.name!r}, as calibrated: {_line(report)}"
-    parts = [_panels(recording, Reading(camera.flip), spec, title)]
+    count = PANELS if not report.motion.wrong else 2 * COLUMNS
+    parts = [_panels(recording, Reading(camera.flip), spec, title, count)]
     if report.motion.wrong:
         best = report.motion.best
         text = f"What fits better ({best.score:.2f}): {told(best.reading, camera.flip)}"
-        parts.append(_panels(recording, best.reading, spec, text))
+        parts.append(_panels(recording, best.reading, spec, text, count))
     width = max(part.width for part in parts)
     whole = Image.new("RGB", (width, sum(part.height for part in parts)), "white")
     top = 0
@@ -204,8 +205,11 @@ def _line(report: Report) -> str:
     return text
 
 
-def _panels(recording: Recording, reading: Reading, spec: AlignSpec, title: str) -> Image.Image:
-    panels = [_panel(recording, reading, spec, name, index) for name, index in _chosen(recording)]
+def _panels(
+    recording: Recording, reading: Reading, spec: AlignSpec, title: str, count: int
+) -> Image.Image:
+    chosen = _chosen(recording, count)
+    panels = [_panel(recording, reading, spec, name, index) for name, index in chosen]
     rows = -(-len(panels) // COLUMNS)
     width = min(COLUMNS, len(panels)) * panels[0].width
     result = Image.new("RGB", (width, CAPTION + rows * panels[0].height), "white")
@@ -216,12 +220,12 @@ def _panels(recording: Recording, reading: Reading, spec: AlignSpec, title: str)
     return result
 
 
-def _chosen(recording: Recording) -> list[tuple[str, int]]:
+def _chosen(recording: Recording, count: int) -> list[tuple[str, int]]:
     """Frames from all over the file."""
     source = recording.source
     lengths = [source.length(name) for name in source.episodes]
     ends = np.cumsum(lengths)
-    frames = np.unique(np.linspace(0, ends[-1] - 1, min(PANELS, int(ends[-1]))).astype(int))
+    frames = np.unique(np.linspace(0, ends[-1] - 1, min(count, int(ends[-1]))).astype(int))
     chosen = []
     for frame in frames:
         episode = int(np.searchsorted(ends, frame, side="right"))

@@ -15,11 +15,9 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
-import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -32,6 +30,7 @@ from rich.table import Table
 from palm_jax._checks import OptionError
 from palm_jax.align import AlignSpec
 from palm_jax.train import console as terminal
+from palm_jax.train import interrupts
 from palm_jax.train.data import aligning, check, importers, inspection, job, soundness
 from palm_jax.train.data import calibration as calib
 from palm_jax.train.data.calibration import Calibration, CameraCalibration, RobotKeys
@@ -411,7 +410,7 @@ class Align:
       layout: of the proprioception.
       border: what happens where the window leaves the frame.
       axis_length: of the overlay, metres.
-      spec: fields of AlignSpec as JSON, in a file or here; they come before the options above.
+      spec: fields of AlignSpec as JSON, in a file or here; they override the options above.
       format: of the output; by default the input's.
       keep: of the source: numbers (all but images), all, or none.
       compression: of the images in HDF5.
@@ -605,9 +604,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     kind, run = COMMANDS[words[0]]
     config: Any = tyro.cli(kind, args=words[1:], prog=f"python -m palm_jax data {words[0]}")
     console = terminal.make_console()
-    before = signal.signal(signal.SIGTERM, _interrupt)
     try:
-        return run(config, console)
+        with interrupts.raising():
+            return run(config, console)
     except (DataError, OptionError) as error:
         print(f"error: {type(error).__name__}: {error}", file=sys.stderr)
         return 2
@@ -615,9 +614,3 @@ def main(argv: Sequence[str] | None = None) -> int:
         saved = "finished episodes" if words[0] == "align" else ""
         terminal.interrupted(console, ["python", "-m", "palm_jax", "data", *words], saved=saved)
         return 130
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt

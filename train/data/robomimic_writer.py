@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import zlib
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -80,9 +83,10 @@ class RobomimicWriter(output.Writer):
     ):
         self.path, self.partial = path, output.partial_path(path)
         self.source, self.keep, self.prefix = source, keep, prefix
-        self.options = COMPRESSIONS[compression]
+        self.compression, self.options = compression, COMPRESSIONS[compression]
         self.actions = "actions" if instead else f"{prefix}_actions"
         self._demo: h5py.Group | None = None
+        self._pool = ThreadPoolExecutor(min(4, os.cpu_count() or 1))
         self.file = self._resume(recipe) or self._start(recipe)
 
     def _start(self, recipe: Mapping[str, Any]) -> h5py.File:
@@ -168,9 +172,19 @@ class RobomimicWriter(output.Writer):
                 options = self.options if key == "image" else {}
                 chunks = (1, *values.shape[1:]) if options else None
                 demo.create_dataset(target, shape, values.dtype, chunks=chunks, **options)
-            demo[target][rows] = values
+            if key == "image" and self.compression == "gzip":
+                self._write_gzip(demo[target], rows, values)
+            else:
+                demo[target][rows] = values
             self._digest(target, values)
         self._filled = rows.stop
+
+    def _write_gzip(self, dataset: h5py.Dataset, rows: slice, images: np.ndarray) -> None:
+        """A chunk for each image, compressed in threads: HDF5's filter would let no other run."""
+        level = self.options["compression_opts"]
+        packed = self._pool.map(lambda image: zlib.compress(image.tobytes(), level), images)
+        for row, content in zip(range(rows.start, rows.stop), packed, strict=True):
+            dataset.id.write_direct_chunk((row, 0, 0, 0), content)
 
     def end(self) -> None:
         demo = self._demo
@@ -184,9 +198,11 @@ class RobomimicWriter(output.Writer):
     def stop(self) -> None:
         if self._demo is not None:
             del self.file[self._demo.name]
+        self._pool.shutdown()
         self.file.close()
 
     def discard(self) -> None:
+        self._pool.shutdown()
         try:
             self.file.close()
         except (OSError, RuntimeError):
@@ -198,6 +214,7 @@ class RobomimicWriter(output.Writer):
         data.attrs["total"] = sum(int(demo.attrs["num_samples"]) for demo in data.values())
         if isinstance(self.source, RobomimicSource):
             copy_masks(self.source.file, self.file, list(data))
+        self._pool.shutdown()
         self.file.close()
         output.publish(self.partial, self.path)
 
