@@ -10,30 +10,36 @@ from palm_jax._quiet import without_lines
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns 0, or 2 for a command that cannot be run, 130 when interrupted."""
     words = list(sys.argv[1:] if argv is None else argv)
-    if not {"-h", "--help"} & set(words):
+    if not any(word in ("-h", "--help") or word.startswith("--distributed") for word in words):
         print("palm_jax: loading JAX and MuJoCo ...", flush=True)
     warnings.filterwarnings("ignore", message=".*donated buffers were not usable.*")
     with without_lines():  # MJX's complaints about the missing warp back end
         from palm_jax.envs.rollout import StartPoseError
         from palm_jax.train import config as configuration
         from palm_jax.train import console as terminal
-        from palm_jax.train import run
+        from palm_jax.train import devices, run
         from palm_jax.train.demos import DemoFileError
 
     console = terminal.make_console()
     try:
         config = configuration.parse(words)
-    except configuration.ConfigError as error:
+        if config.distributed:
+            devices.connect(config.distributed)
+    except (configuration.ConfigError, devices.DeviceError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     try:
         run.execute(config, console)
-    except (configuration.ConfigError, DemoFileError, StartPoseError) as error:
+    except (
+        configuration.ConfigError, devices.DeviceError, DemoFileError, StartPoseError
+    ) as error:  # fmt: skip
         print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        terminal.interrupted(console, run.resume_command(config))
-        return 130
+        return devices.leave(2)
+    except KeyboardInterrupt as stop:
+        if devices.is_first():
+            terminal.interrupted(console, run.resume_command(config))
+        # What all processes agreed on ends all of them in order.
+        return 130 if isinstance(stop, run.Interrupted) else devices.leave(130)
     return 0
 
 

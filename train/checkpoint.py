@@ -19,6 +19,7 @@ No pickle is written or read. A tree is stored as its leaves by name ("params/he
 that a checkpoint depends on no class of Flax or Optax; the target of `load` gives the structure.
 """
 
+import contextlib
 import hashlib
 import importlib.metadata
 import json
@@ -167,7 +168,18 @@ def save(
 def _write_arrays(path: Path, named: Mapping[str, Any]) -> None:
     host = {name: np.asarray(leaf) for name, leaf in named.items()}
     # Orbax refuses arrays without elements; the manifest's shape and dtype say all about them.
-    ocp.save(path, _nested({name: array for name, array in host.items() if array.size}))
+    with _alone():
+        ocp.save(path, _nested({name: array for name, array in host.items() if array.size}))
+
+
+def _alone() -> contextlib.AbstractContextManager[Any]:
+    """Lets Orbax work in this process only. With several it would wait for the others to make the
+    same call; but parameters are the same everywhere, and one process writes and reads them."""
+    if jax.process_count() == 1:
+        return contextlib.nullcontext()
+    me = jax.process_index()
+    options = ocp.options.MultiprocessingOptions(primary_host=me, active_processes={me})
+    return ocp.Context(multiprocessing_options=options)
 
 
 def _hash_files(folder: Path) -> dict[str, dict[str, Any]]:
@@ -396,9 +408,11 @@ def _compare(path: Path, saved: Mapping[str, Any], wanted: Mapping[str, Any]) ->
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     """All leaves as host arrays, whatever devices they were saved from."""
     path = path.absolute()
-    metadata = ocp.metadata(path).metadata
-    like = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), metadata)
-    return {name: np.asarray(leaf) for name, leaf in _named_leaves(ocp.load(path, like)).items()}
+    with _alone():
+        metadata = ocp.metadata(path).metadata
+        like = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), metadata)
+        found = ocp.load(path, like)
+    return {name: np.asarray(leaf) for name, leaf in _named_leaves(found).items()}
 
 
 def _restore(value: np.ndarray, like: Any) -> Any:
@@ -419,6 +433,12 @@ def read_meta(path: str | Path) -> dict[str, Any]:
       DamagedCheckpoint: the manifest is missing or damaged.
     """
     return _read_manifest(Path(path))["meta"]
+
+
+def fingerprint(path: str | Path) -> str:
+    """SHA-256 of what a checkpoint holds: equal for copies, whatever their meta data say."""
+    manifest = _read_manifest(Path(path))
+    return _digest({name: manifest[name] for name in ("step", "files", "leaves")})
 
 
 def update_meta(path: str | Path, **values: Any) -> None:

@@ -12,6 +12,7 @@ from palm_jax.envs import registry, shifts
 from palm_jax.envs.base import EnvParams, State
 from palm_jax.envs.rollout import Act, Episodes, Runner, take_params
 from palm_jax.envs.tasks import Task
+from palm_jax.train import devices
 from palm_jax.train.learner import Learner, PolicyState
 from palm_jax.train.methods import Method
 from palm_jax.train.records import DomainRecord
@@ -36,8 +37,12 @@ class Runners:
 
     @classmethod
     def of(cls, task: str, robot: str, other: str, worlds: int) -> "Runners":
-        """The runners of a task and two robots by name, `worlds` worlds a batch."""
-        return cls(lambda name: Runner(registry.make(task, name), worlds), robot, other)
+        """The runners of a task and two robots by name, `worlds` worlds a batch, which this
+        process's devices share."""
+        found = devices.local_for(worlds)
+        return cls(
+            lambda name: Runner(registry.make(task, name), worlds, devices=found), robot, other
+        )
 
     @property
     def first(self) -> Runner:
