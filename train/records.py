@@ -136,7 +136,8 @@ def counts(records: Mapping[str, DomainRecord]) -> dict[str, dict[str, int]]:
     }
 
 
-def _write_arrays(path: Path, arrays: Mapping[str, ArrayLike]) -> Path:
+def write_arrays(path: Path, arrays: Mapping[str, ArrayLike]) -> Path:
+    """Write an .npz file, whole or not at all; nothing in it is pickled."""
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, **arrays)
     return write_atomic(path, content.getvalue())
@@ -157,12 +158,12 @@ def save_eval(path: Path, records: Mapping[str, Mapping[str, ArrayLike] | Domain
             record = domain_record(values, where=domain)
         for field in fields(record):
             arrays[f"{domain}/{field.name}"] = getattr(record, field.name)
-    return _write_arrays(path, arrays)
+    return write_arrays(path, arrays)
 
 
 def save_sweep(path: Path, sweep: Sweep) -> Path:
     """Write sweep.npz, whole or not at all."""
-    return _write_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
+    return write_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
 
 
 def sweep_path(folder: Path, robot: str = "", *, shift: str = "") -> Path:
@@ -185,12 +186,12 @@ def swept_robot(path: Path) -> str:
 
 def save_strengths(path: Path, sweep: StrengthSweep) -> Path:
     """Write a `StrengthSweep`, whole or not at all."""
-    return _write_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
+    return write_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
 
 
 def load_strengths(path: Path) -> StrengthSweep:
     """Read a `StrengthSweep`."""
-    arrays = _load_arrays(path)
+    arrays = load_arrays(path)
     missing = {field.name for field in fields(StrengthSweep)} - set(arrays)
     if missing:
         raise RecordError(f"{path}: missing {', '.join(sorted(missing))}")
@@ -204,7 +205,8 @@ def load_strengths(path: Path) -> StrengthSweep:
     return StrengthSweep(str(arrays["shift"]), strengths, success, nan)
 
 
-def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Read an .npz file; raises RecordError, and never unpickles."""
     try:
         # From memory: NumPy leaves a file that it cannot read open.
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
@@ -216,7 +218,7 @@ def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
 def load_eval(path: Path) -> dict[str, DomainRecord]:
     """Read eval.npz; the domains come in the order in which they were written."""
     grouped: dict[str, dict[str, NDArray[Any]]] = {}
-    for name, array in _load_arrays(path).items():
+    for name, array in load_arrays(path).items():
         domain, _, field = name.rpartition("/")
         if not domain:
             raise RecordError(f"{path}: array {name!r} is not named domain/field")
@@ -228,7 +230,7 @@ def load_eval(path: Path) -> dict[str, DomainRecord]:
 
 def load_sweep(path: Path) -> Sweep:
     """Read sweep.npz."""
-    arrays = _load_arrays(path)
+    arrays = load_arrays(path)
     missing = {"angles", "xs", "ys", "success"} - set(arrays)
     if missing:
         raise RecordError(f"{path}: missing {', '.join(sorted(missing))}")

@@ -24,8 +24,8 @@ from rich.console import Console
 from palm_jax.envs import registry, shifts
 from palm_jax.envs.base import EnvParams
 from palm_jax.envs.rollout import repeat_params, take_params
+from palm_jax.train import checkpoint, records, report, runs, shards, workspace
 from palm_jax.train import console as terminal
-from palm_jax.train import records, report, runs, workspace
 from palm_jax.train.evaluate import Evaluator, Runners
 from palm_jax.train.learner import PolicyState
 
@@ -46,6 +46,9 @@ class SweepConfig:
       seed: of the scenes.
       batch: worlds simulated at once (at most 128 on a CPU).
       redo: sweep again where a sweep is there already.
+      shard: "i/n", the i-th of n machines (from 1): it runs every n-th batch of the grid, or every
+        n-th strength, into RUN/shards.
+      merge: join the shards of this very command into one sweep; nothing is run.
     """
 
     run: tyro.conf.Positional[Path]
@@ -58,6 +61,8 @@ class SweepConfig:
     seed: int = 2000
     batch: int = 64
     redo: bool = False
+    shard: str = ""
+    merge: bool = False
 
 
 def angles_of(text: str) -> np.ndarray:
@@ -133,6 +138,7 @@ def sweep(
     episodes: int,
     seed: int,
     aligned: bool,
+    shard: tuple[int, int] = (1, 1),
     progress: Callable[[int], None] | None = None,
 ) -> records.Sweep:
     """Runs every cell of the grid.
@@ -144,6 +150,7 @@ def sweep(
       episodes: S, in every cell.
       seed: of the scenes.
       aligned: whether the hand's initial yaw turns with the camera.
+      shard: (i, n) runs every n-th unit, see `palm_jax.train.shards`; the others stay failures.
       progress: told how many episodes were finished.
     """
     params = evaluator.runner.env.default_params()
@@ -153,6 +160,8 @@ def sweep(
     total, batch = len(angles) * len(xs) * len(ys) * episodes, evaluator.runner.worlds
     success, nan = np.zeros(total, bool), np.zeros(total, bool)
     for first in range(0, total, batch):
+        if first // batch % shard[1] != shard[0] - 1:
+            continue
         rows = np.arange(first, min(first + batch, total))
         part = take_params(cells, rows)
         scenes = jax.random.fold_in(jax.random.key(seed), first)
@@ -173,6 +182,7 @@ def sweep_strength(
     episodes: int,
     seed: int,
     aligned: bool,
+    shard: tuple[int, int] = (1, 1),
     progress: Callable[[int], None] | None = None,
 ) -> records.StrengthSweep:
     """Runs the same scenes at every strength of a shift.
@@ -185,6 +195,7 @@ def sweep_strength(
       episodes: S, the scenes.
       seed: of the scenes.
       aligned: whether the hand's initial yaw turns with the camera.
+      shard: (i, n) runs every n-th unit, see `palm_jax.train.shards`; the others stay failures.
       progress: told how many episodes were finished.
 
     """
@@ -193,6 +204,8 @@ def sweep_strength(
         params = shifts.aligned_hand(params)
     success, nan = np.zeros((2, len(strengths), episodes), bool)
     for row, strength in enumerate(strengths):
+        if row % shard[1] != shard[0] - 1:
+            continue
         there = repeat_params(shifts.shifted(params, shift, strength=float(strength)), episodes)
         result = evaluator.episodes(policy, jax.random.key(seed), there, episodes)
         success[row], nan[row] = result.success, result.nan
@@ -208,6 +221,13 @@ class Job(NamedTuple):
     episodes: int  # in all
     run: Callable[..., Any]  # `sweep` or `sweep_strength`, their grids bound
     save: Callable[[Path, Any], Path]
+    record: type[Any]  # what is saved
+    grid: dict[str, Any]  # fields of the record that the command says
+    units: np.ndarray  # number of the unit of every episode, in the shape of `success`
+
+    def part(self, shard: tuple[int, int]) -> int:
+        """Episodes of a shard."""
+        return int((self.units % shard[1] == shard[0] - 1).sum())
 
 
 def job(config: SweepConfig) -> Job:
@@ -227,11 +247,18 @@ def job(config: SweepConfig) -> Job:
         run = partial(sweep_strength, shift=config.shift, strengths=strengths, episodes=count)
         # Worlds beyond the scenes of one strength would run for nothing.
         worlds = min(config.batch, count)
-        return Job(worlds, len(strengths) * count, run, records.save_strengths)
+        units = np.repeat(np.arange(len(strengths))[:, None], count, axis=1)
+        line = {"shift": config.shift, "strengths": strengths}
+        return Job(
+            worlds, units.size, run, records.save_strengths, records.StrengthSweep, line, units
+        )
     angles, (xs, ys) = angles_of(config.camera), cells_of(config.workspace)
     count = config.episodes or 1
     grid = partial(sweep, angles=angles, xs=xs, ys=ys, episodes=count)
-    return Job(config.batch, len(angles) * len(xs) * len(ys) * count, grid, records.save_sweep)
+    shape = (len(angles), len(xs), len(ys), count)
+    units = (np.arange(np.prod(shape)) // config.batch).reshape(shape)
+    axes = {"angles": angles, "xs": xs, "ys": ys}
+    return Job(config.batch, units.size, grid, records.save_sweep, records.Sweep, axes, units)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -243,12 +270,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         console.print(f"error: {error}", markup=False)
         return 2
+    if config.shard:
+        return 0  # the report is for the one who joins the shards
     return report.main([str(config.run)])
 
 
 def _run(config: SweepConfig, console: Console) -> None:
     """Sweeps every run that the command is about, and writes the files."""
-    asked = job(config)
+    asked, shard = job(config), shards.parse(config.shard) if config.shard else (1, 1)
+    if config.shard and config.merge:
+        raise ValueError("shard, merge: expected one of them; --merge alone joins the shards")
     if config.robot and config.robot not in registry.ROBOTS:
         raise ValueError(f"unknown robot {config.robot!r}; known: {', '.join(registry.ROBOTS)}")
     folders = runs.find_runs(config.run) if config.run.is_dir() else []
@@ -261,20 +292,54 @@ def _run(config: SweepConfig, console: Console) -> None:
         path = records.sweep_path(
             folder, "" if robot == stored.robot else robot, shift=config.shift
         )
-        if path.exists() and not config.redo:
-            console.print(f"{folder}: swept already (--redo to sweep again)")
+        if config.merge:
+            asked.save(path, _merged(config, asked, folder, path))
+            console.print(f"Joined: {path}", markup=False)
+            continue
+        into = shards.path_of(path, *shard) if config.shard else path
+        if into.exists() and not config.redo:
+            if config.shard:
+                shards.check(into, shards.load(into)[1], _header(config, folder))
+            console.print(f"{folder}: swept already (--redo to sweep again)", markup=False)
             continue
         world = stored.task, robot
         if world not in runners:
             runners[world] = Runners.of(stored.task, robot, stored.second_robot, asked.worlds)
         evaluator, policy = workspace.load_policy(folder, runners[world])
         label = f"sweep {evaluator.method.name}"
-        with terminal.ProgressBar(console, asked.episodes, label, unit="episode") as bar:
+        with terminal.ProgressBar(console, asked.part(shard), label, unit="episode") as bar:
             found = asked.run(
                 evaluator,
                 policy,
                 seed=config.seed,
                 aligned=workspace.quoted_variant(folder) == "aligned",
+                shard=shard,
                 progress=bar.advance,
             )
-        asked.save(path, found)
+        if config.shard:
+            shards.save(into, vars(found), _header(config, folder))
+            console.print(f"Shard {config.shard}: {into}", markup=False)
+        else:
+            asked.save(path, found)
+
+
+def _header(config: SweepConfig, folder: Path) -> dict[str, Any]:
+    """The conditions of a run's sweep in which its shards must agree."""
+    best = checkpoint.best(folder / "checkpoints")
+    stored = workspace.stored_config(folder)
+    return {
+        "task": stored.task,
+        "method": stored.method[0],
+        "robot": config.robot or stored.robot,
+        "episodes": config.episodes,
+        "seed": config.seed,
+        "batch": config.batch,
+        "aligned": workspace.quoted_variant(folder) == "aligned",
+        "policy": checkpoint.fingerprint(best[0][1]) if best else None,
+        "versions": workspace.versions(),
+    }
+
+
+def _merged(config: SweepConfig, asked: Job, folder: Path, path: Path) -> Any:
+    arrays = shards.merge(path, asked.units, asked.grid, _header(config, folder))
+    return asked.record(**{**asked.grid, "success": arrays["success"], "nan": arrays["nan"]})
