@@ -28,8 +28,8 @@ import math
 import os
 import platform
 import shutil
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import jax
@@ -236,6 +236,7 @@ def verify(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     manifest = _read_manifest(path)
+    _refuse_ways_out(path, manifest["files"])
     for name, expected in manifest["files"].items():
         file = path / name
         if not file.is_file():
@@ -251,7 +252,21 @@ def verify(path: str | Path) -> dict[str, Any]:
     return manifest
 
 
+def _refuse_ways_out(path: Path, names: Iterable[str]) -> None:
+    """Whoever made the files, reading a checkpoint reads its own folder and nothing else."""
+    for name in names:
+        parts = PurePosixPath(name).parts
+        if not parts or name.startswith("/") or ".." in parts:
+            raise DamagedCheckpoint(path, "way-out", f"{MANIFEST} names {name!r}, a file elsewhere")
+    for folder, folders, files in os.walk(path):
+        for link in (Path(folder, name) for name in folders + files):
+            if link.is_symlink():
+                raise DamagedCheckpoint(path, "link", f"{link.relative_to(path)} is a link")
+
+
 def _read_manifest(path: Path) -> dict[str, Any]:
+    if path.is_symlink() or (path / MANIFEST).is_symlink():
+        raise DamagedCheckpoint(path, "link", "expected a folder and files, not links")
     if not path.is_dir():
         raise DamagedCheckpoint(path, "not-a-folder", "expected a folder")
     if not any(path.iterdir()):

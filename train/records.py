@@ -13,6 +13,7 @@ names the file and the problem.
 
 import io
 import json
+import re
 import warnings
 import zipfile
 import zlib
@@ -176,6 +177,11 @@ def sweep_path(folder: Path, robot: str = "", *, shift: str = "") -> Path:
     """
     stem = f"strength-{shift}" if shift else "sweep"
     return folder / f"{stem}{f'-{robot}' if robot else ''}.npz"
+
+
+def file_word(name: str) -> str:
+    """A name that comes from a file, as part of a file's name: it leads into no other folder."""
+    return re.sub(r"[^\w+-]+", "-", name)[:80]
 
 
 def swept_robot(path: Path) -> str:

@@ -129,7 +129,8 @@ def execute(config: Config, console: Console) -> Path:
         write_json(out / "summary.json", counts)
     terminal.results(console, counts)
     console.print(
-        f"Report: {out / 'report.html'}   ({terminal.duration(time.monotonic() - start)})"
+        f"Report: {out / 'report.html'}   ({terminal.duration(time.monotonic() - start)})",
+        markup=False,
     )
     devices.wait()
     return out

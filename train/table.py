@@ -239,7 +239,9 @@ def run(config: TableConfig, console: Console) -> Path:
         _merge_all(config, table, fresh)
         return config.file
     missing = [cell for cell in asked if _get(table, "results", cell) is None]
-    console.print(f"{len(asked)} cells, {len(asked) - len(missing)} done, into {config.file}")
+    console.print(
+        f"{len(asked)} cells, {len(asked) - len(missing)} done, into {config.file}", markup=False
+    )
     took: list[float] = []
     for number, cell in enumerate(missing):
         _announce(console, cell, len(missing) - number, took)
@@ -252,7 +254,9 @@ def run(config: TableConfig, console: Console) -> Path:
             took.append(time.monotonic() - start)
         else:
             _put(table, "failed", cell, str(log))
-            console.print(f"{cell.name} failed (exit code {code}): see {log}", style="bold red")
+            console.print(
+                f"{cell.name} failed (exit code {code}): see {log}", style="bold red", markup=False
+            )
         _note_origin(table["header"], fresh)
         write_json(config.file, table)
     return config.file
@@ -383,7 +387,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if config.page is not None:
             written = table_page.write(config.file, config.page)
-            console.print(f"Written: {', '.join(map(str, written))}", highlight=False)
+            console.print(f"Written: {', '.join(map(str, written))}", highlight=False, markup=False)
             return 0
         path = run(config, console)
     except (ConfigError, records.RecordError) as error:
@@ -393,5 +397,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         console.print("Stopped; the same command goes on with what is missing.")
         return 130
     failed = list(_cells_of(records.load_json(path), "failed"))
-    console.print(f"Results: {path}" + (f"; {len(failed)} cells failed" if failed else ""))
+    words = f"; {len(failed)} cells failed" if failed else ""
+    console.print(f"Results: {path}{words}", markup=False)
     return 1 if failed else 0
