@@ -35,6 +35,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as orbax
 from orbax.checkpoint import v1 as ocp
 
 from palm_jax.train.metrics import fsync_folder, plain, write_atomic
@@ -168,18 +169,31 @@ def save(
 def _write_arrays(path: Path, named: Mapping[str, Any]) -> None:
     host = {name: np.asarray(leaf) for name, leaf in named.items()}
     # Orbax refuses arrays without elements; the manifest's shape and dtype say all about them.
-    with _alone():
-        ocp.save(path, _nested({name: array for name, array in host.items() if array.size}))
+    tree = _nested({name: array for name, array in host.items() if array.size})
+    if jax.process_count() == 1:
+        ocp.save(path, tree)
+        return
+    # Parameters are the same in every process, and one of them writes; but ocp.save (0.12.8) would
+    # wait for the others all the same. The older interface does what its options say.
+    options = orbax.options.MultiprocessingOptions(**_alone())
+    handler = orbax.PyTreeCheckpointHandler(multiprocessing_options=options)
+    with orbax.Checkpointer(handler, multiprocessing_options=options) as checkpointer:
+        checkpointer.save(path, tree)
 
 
-def _alone() -> contextlib.AbstractContextManager[Any]:
-    """Lets Orbax work in this process only. With several it would wait for the others to make the
-    same call; but parameters are the same everywhere, and one process writes and reads them."""
+def _alone() -> dict[str, Any]:
+    """Orbax's words for: this process, without the others."""
+    return {"primary_host": jax.process_index(), "active_processes": {jax.process_index()}}
+
+
+def _reading() -> contextlib.AbstractContextManager[Any]:
+    """Lets Orbax read in this process without the others."""
     if jax.process_count() == 1:
         return contextlib.nullcontext()
-    me = jax.process_index()
-    options = ocp.options.MultiprocessingOptions(primary_host=me, active_processes={me})
-    return ocp.Context(multiprocessing_options=options)
+    context = ocp.Context()
+    for name, value in _alone().items():
+        setattr(context.multiprocessing, name, value)
+    return context
 
 
 def _hash_files(folder: Path) -> dict[str, dict[str, Any]]:
@@ -423,7 +437,7 @@ def _compare(path: Path, saved: Mapping[str, Any], wanted: Mapping[str, Any]) ->
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     """All leaves as host arrays, whatever devices they were saved from."""
     path = path.absolute()
-    with _alone():
+    with _reading():
         metadata = ocp.metadata(path).metadata
         like = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), metadata)
         found = ocp.load(path, like)
