@@ -1,6 +1,7 @@
 """`python -m palm_jax.train`: demonstrations, training, evaluation and report in one command."""
 
 import sys
+import traceback
 import warnings
 from collections.abc import Sequence
 
@@ -40,6 +41,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             terminal.interrupted(console, run.resume_command(config))
         # What all processes agreed on ends all of them in order.
         return 130 if isinstance(stop, run.Interrupted) else devices.leave(130)
+    except Exception:
+        if devices.alone():
+            raise
+        traceback.print_exc()
+        return devices.leave(1)
     return 0
 
 

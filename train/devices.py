@@ -111,10 +111,15 @@ def is_first() -> bool:
     return jax.process_index() == 0
 
 
+def alone() -> bool:
+    """Whether there is no other process."""
+    return jax.process_count() == 1
+
+
 def leave(status: int) -> int:
     """The exit status of a process that fails, which does not wait for the others to end: JAX ends
     them when it is gone, where an orderly exit would wait for them for minutes."""
-    if jax.process_count() > 1:
+    if not alone():
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
@@ -126,7 +131,7 @@ def wait() -> None:
 
     For hours, if need be: unlike a collective operation it occupies no device.
     """
-    if jax.process_count() > 1:
+    if not alone():
         multihost.sync_global_processes(
             f"palm_jax-{next(_barriers)}",
             processes=set(range(jax.process_count())),
@@ -140,7 +145,7 @@ def from_first(tree: Any) -> Any:
     Args:
       tree: of the same structure, shapes and dtypes everywhere; its values count on the first only.
     """
-    if jax.process_count() == 1:
+    if alone():
         return tree
     wait()  # the others may have been waiting for long
     leaves, structure = jax.tree.flatten(tree)
@@ -169,7 +174,7 @@ class Together:
         self._heard = False
 
     def __call__(self) -> bool:
-        if jax.process_count() > 1 and not self._heard and next(self._calls) % AGREE_EVERY == 0:
+        if not alone() and not self._heard and next(self._calls) % AGREE_EVERY == 0:
             asked = multihost_utils.process_allgather(np.asarray(self._asked()))
             self._heard = bool(np.any(asked))
         return self.agreed
@@ -177,7 +182,7 @@ class Together:
     @property
     def agreed(self) -> bool:
         """Whether to stop, as far as is known: asks nobody."""
-        return self._asked() if jax.process_count() == 1 else self._heard
+        return self._asked() if alone() else self._heard
 
 
 # ---------------------------------------------------------------------------------------- devices
