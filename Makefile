@@ -6,18 +6,20 @@ VENV ?= .venv
 DEMO_ARGS ?= --preset quick --out runs/demo
 BENCH_ARGS ?=
 PYTEST_ARGS ?=
+FAULTS_ARGS ?=
 TEST_JOBS ?= 2
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-playground lint bench clean
+.PHONY: help demo test test-playground lint faults bench clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
 	@echo "make test-playground  the tests of the MuJoCo Playground adapter, with Playground itself"
 	@echo "make lint   ruff and mypy only"
+	@echo "make faults kills, damages and fills whatever can be, and writes docs/reliability.md"
 	@echo "make bench  speed, side by side with other packages (BENCH_ARGS=\"render\")"
 	@echo "make clean  remove .venv, builds and caches (never runs/)"
 
@@ -61,6 +63,12 @@ test: lint
 test-playground: $(VENV)/.playground
 	$(BIN)/python -c 'import mujoco_playground'
 	$(BIN)/python -m pytest tests/envs/test_playground.py $(PYTEST_ARGS)
+
+# Compiled programs are kept, as by the tests: every process that is killed compiles the same.
+faults: export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.pytest_cache/xla
+faults: export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.1
+faults: $(VENV)/.test
+	PYTHONPATH=tests $(BIN)/python -m faults.campaign $(FAULTS_ARGS)
 
 bench: $(VENV)/.bench
 	$(BIN)/python -m palm_jax bench $(BENCH_ARGS)

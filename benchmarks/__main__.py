@@ -1,4 +1,4 @@
-"""`python -m palm_jax bench [render|physics|align|train|eval|all] [--json FILE]`.
+"""`python -m palm_jax bench [render|physics|align|data|train|eval|all] [--json FILE]`.
 
 `bench worlds` has its own options, see `benchmarks.bench_worlds`.
 
@@ -30,6 +30,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     "render": Benchmark(("bench_lift_spam", "bench_render"), "frames_per_second"),
     "physics": Benchmark(("bench_physics",), "steps_per_second"),
     "align": Benchmark(("bench_align",), "images_per_second"),
+    "data": Benchmark(("bench_data",), "file_frames_per_second"),
     "train": Benchmark(("bench_train",), "samples_per_second"),
     "eval": Benchmark(("bench_eval",), "seconds"),
 }

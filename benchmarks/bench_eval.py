@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from palm_jax.envs import make, shifts
 from palm_jax.envs.registry import TASKS
@@ -51,8 +52,8 @@ class TimedEvaluator(Evaluator):
 
     clock: Clock = dataclasses.field(default_factory=dict)
 
-    def act(self, policy: PolicyState) -> Act:
-        return timed(self.clock, "policy", super().act(policy))
+    def act(self, policy: PolicyState, rows: np.ndarray | None = None) -> Act:
+        return timed(self.clock, "policy", super().act(policy, rows))
 
 
 def run(*, task: str = "lift_spam", scenes: int = 50, horizon: int | None = None) -> dict[str, Any]:

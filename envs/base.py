@@ -44,6 +44,9 @@ PAPER_FRAME = 512
 WIDE_FRAME = 1024
 """Side in pixels of the default virtual frame: wide enough that a TCP crop never clamps."""
 
+CAMERA_FOVY = 40.0
+"""Vertical field of view in degrees of the paper's image."""
+
 _LOCATE_SIZE = 128  # the mask for the global policy: the wide frame at an eighth
 _SUBSTEPS = 10
 _AREA_MARGIN = 0.12  # other objects may stand this far outside the target's region, metres
@@ -165,7 +168,7 @@ class Env:
         lights, table = self.scene_model.lights, self.scene_model.table
         values = {
             "camera_to_world": front_camera(),
-            "camera_fovy": 40.0,
+            "camera_fovy": CAMERA_FOVY,
             "camera_angle": (0.0, 0.0),
             "camera_radius": (1.0, 1.0),
             "calibration_pixels": np.zeros(2),

@@ -104,12 +104,17 @@ class Demonstrator:
     ) -> "_Command":
         env = self.runner.env
         action = env.expert(state)
-        fresh = jax.random.normal(key, (4,)) * noise
-        push = _CORRELATION * push + jnp.sqrt(1 - _CORRELATION**2) * fresh
         opening = env.opening(state)
         free = (action[9] > 0.5) & (opening > _FREE_OPENING)
+        push = next_push(key, push, noise)
         scaled = jnp.where(free, 1.0, _HELD_SHARE) * push
         return _Command(action, disturbed(action, scaled), push, env.tcp(state), opening)
+
+
+def next_push(key: jax.Array, push: jax.Array, noise: jax.Array) -> jax.Array:
+    """The disturbance [4] that follows on `push` [4], of standard deviation `noise` [] (metres)."""
+    fresh = jax.random.normal(key, (4,)) * noise
+    return _CORRELATION * push + jnp.sqrt(1 - _CORRELATION**2) * fresh
 
 
 def disturbed(action: jax.Array, push: jax.Array) -> jax.Array:

@@ -167,7 +167,8 @@ class Runner:
             )
         self.env = env
         self.worlds = worlds
-        self._batched = batched_over(devices or (), worlds)
+        self._devices = tuple(devices or ())
+        self._batched = batched_over(self._devices, worlds)
         self._act = physics.jit_physics(self._batched(env.act))
         self._jump = physics.jit_physics(self._batched(_jump_if_asked(env)))
         self.expert = physics.jit_physics(self._batched(env.expert))
@@ -176,6 +177,15 @@ class Runner:
         self.restore = physics.jit_physics(self._batched(env.restore))
         self._reposition = physics.jit_physics(self._batched(env.reposition))
         self._views: dict[Hashable, Callable[..., Any]] = {}
+
+    def halved(self) -> "Runner":
+        """The same environment for half as many worlds (at least one): compiled anew.
+
+        With several devices, half of the worlds of each, or one device if they do not divide them.
+        """
+        worlds = max(self.worlds // 2, 1)
+        shared = len(self._devices) > 0 and worlds % len(self._devices) == 0
+        return Runner(self.env, worlds, devices=self._devices if shared else None)
 
     def reset(self, keys: jax.Array, params: EnvParams) -> State:
         """`Env.reset` of W worlds, in three compiled pieces.

@@ -16,10 +16,11 @@ from palm_jax._quiet import without_lines
 
 
 class Verb(NamedTuple):
-    """One command: the module that holds its `main`, and a line for `--help`."""
+    """One command: the module that holds its `main`, a line for `--help`, the extra it needs."""
 
     module: str
     help: str
+    extra: str = ""
 
 
 VERBS: dict[str, Verb] = {
@@ -27,7 +28,13 @@ VERBS: dict[str, Verb] = {
     "sweep": Verb("palm_jax.train.sweep", "success over a grid of shifts, for a finished run"),
     "table": Verb("palm_jax.train.table", "every cell of the paper's main table, resumable"),
     "report": Verb("palm_jax.train.report", "one self-contained HTML page from run folders"),
+    "data": Verb("palm_jax.train.data.commands", "your own robot data: inspect, check, align"),
     "show": Verb("palm_jax.train.show", "pictures of every task, robot and shift, as PNG"),
+    "serve": Verb("palm_jax.train.serve", "a policy behind a websocket, for a robot", "serve"),
+    "export": Verb(
+        "palm_jax.train.export", "a policy as StableHLO, for use without Python", "export"
+    ),
+    "debug": Verb("palm_jax.train.debug", "repeat and explain an update that failed"),
     "bench": Verb("benchmarks.__main__", "speed, side by side with peers (needs a checkout)"),
 }
 
@@ -93,8 +100,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.path.insert(0, str(root))  # the console script does not look into the checkout
     # Before the slow imports, and on stderr: verbs such as bench print JSON on stdout.
     print(f"palm_jax {__version__}: {name}", file=sys.stderr, flush=True)
-    with without_lines():
-        module = importlib.import_module(VERBS[name].module)
+    try:
+        with without_lines():
+            module = importlib.import_module(VERBS[name].module)
+    except ModuleNotFoundError as error:
+        if not VERBS[name].extra:
+            raise
+        hint = f"pip install 'palm-jax[{VERBS[name].extra}]'"
+        sys.stderr.write(f"palm-jax: {name} needs {error.name}: {hint}\n")
+        return 2
     return int(module.main(rest) or 0)
 
 

@@ -40,7 +40,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 _TOGETHER = {
-    "envs": ("test_demos.py",),  # besides all of tests/envs that is not named here
+    "envs": (
+        "test_demos.py",
+        "test_policy_frames.py",
+    ),  # besides all of tests/envs that is not named here
     "stages": ("test_stages.py", "test_docs.py"),
     "gym": ("test_gym.py",),  # late, when its worlds have been compiled by the others
 }

@@ -205,3 +205,16 @@ def grid_crop(image: np.ndarray, start: np.ndarray, size: int) -> np.ndarray:
     across = start[0] + np.linspace(0, size / width * (width - 1), size)
     down = start[1] + np.linspace(0, size / height * (height - 1), size)
     return np.array([[bilinear(image, x, y) for x in across] for y in down])
+
+
+def reframed(image: np.ndarray, camera, other) -> np.ndarray:
+    """The ray of each pixel of the other camera, looked up in the image; as floats."""
+    height, width = image.shape[:2]
+    out = np.zeros((other.height, other.width, image.shape[2]))
+    for i in range(other.height):
+        for j in range(other.width):
+            ray = np.linalg.solve(np.asarray(other.K, float), [j + 0.5, i + 0.5, 1])
+            x, y, _ = np.asarray(camera.K, float) @ ray
+            x, y = np.clip([x - 0.5, y - 0.5], 0, [width - 1, height - 1])
+            out[i, j] = bilinear(image, x, y)
+    return out

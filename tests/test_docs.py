@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tiny
 import worlds as compiled
 
 from palm_jax.__main__ import VERBS
@@ -21,7 +22,7 @@ def readme_code() -> list[str]:
 
 
 def test_the_readme_example_runs() -> None:
-    code, _ = readme_code()
+    code, _, _ = readme_code()
     # A camera one metre above the table's centre that looks straight down; the hand below it.
     down = np.diag([1.0, -1.0, -1.0, 1.0])
     cam_to_world, tcp = down.copy(), down.copy()
@@ -43,7 +44,7 @@ def test_the_readme_example_runs() -> None:
 
 def test_the_readme_worlds_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """With fewer worlds: those that the other tests have compiled."""
-    _, code = readme_code()
+    _, code, _ = readme_code()
     asked = []
 
     def runner(env: Env, worlds: int) -> Runner:
@@ -57,6 +58,22 @@ def test_the_readme_worlds_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert asked == [compiled.WORLDS] and isinstance(state, State)
     assert (np.asarray(state.step) == 1).all() and state.step.shape == (compiled.WORLDS,)
     assert np.ptp(np.asarray(names["params"].light_ambient)) > 0.1  # type: ignore[attr-defined]
+
+
+def test_the_readme_policy_runs() -> None:
+    *_, code = readme_code()
+    down = np.diag([1.0, -1.0, -1.0, 1.0])
+    cam_to_world, tcp = down.copy(), down.copy()
+    cam_to_world[:3, 3], tcp[:3, 3] = (0.25, 0.0, 1.752), (0.25, 0.0, 0.9)
+    names: dict[str, object] = {
+        "image": np.full((480, 640, 3), 90, np.uint8),
+        "K": np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]]),
+        "cam_to_world": cam_to_world,
+        "tcp": tcp,
+        "opening": 1.0,
+    }
+    exec(compile(code.replace("runs/demo/palm", str(tiny.run())), "README.md", "exec"), names)
+    assert np.asarray(names["target"]).shape == (4, 4) and names["gripper"] in (0.0, 1.0)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

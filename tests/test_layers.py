@@ -11,15 +11,20 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 # The dispatcher names train's modules as strings and looks for a checkout: a thin shell, no core.
+SHELL = ROOT / "palm_jax" / "__main__.py"
+# Short names for what train offers to other programs: they hold nothing but imports.
+DOORS = [ROOT / "palm_jax" / "policy.py"]
+# Run in a robot's process, which has no JAX.
+CLIENT = [ROOT / "palm_jax" / name for name in ("policy_client.py", "wire.py")]
 CORE = sorted(
     path
     for path in (ROOT / "palm_jax").rglob("*.py")
     if not {"envs", "train"} & set(path.relative_to(ROOT / "palm_jax").parts)
-    and path.name != "__main__.py"
+    and path not in (SHELL, *DOORS)
 )
 ENVS = sorted((ROOT / "envs").rglob("*.py"))
 TRAIN = sorted((ROOT / "train").rglob("*.py"))
-LIBRARY = CORE + ENVS + TRAIN
+LIBRARY = CORE + DOORS + ENVS + TRAIN
 
 WRITERS = {"open", "write_text", "write_bytes", "savez", "savez_compressed", "savefig", "mkdir"}
 CLOCKS_AND_FILES = {"time", "datetime", "pathlib", "shutil", "tempfile"}
@@ -58,6 +63,23 @@ def offences(source: str, *forbidden: str) -> list[str]:
     return sorted({name for name in imported(source) if within(name, *forbidden)})
 
 
+def beyond_a_door(source: str) -> list[str]:
+    """What a module holds besides a docstring, imports from train, and `__all__` of just those."""
+    tree, names, found = ast.parse(source), set(), []
+    for node in tree.body:
+        match node:
+            case ast.Expr(value=ast.Constant(value=str())):
+                pass
+            case ast.ImportFrom(module=str(module)) if within(module, "palm_jax.train"):
+                names |= {alias.asname or alias.name for alias in node.names}
+            case ast.Assign(targets=[ast.Name(id="__all__")]):
+                offered = ast.literal_eval(node.value)
+                found += sorted(set(offered) ^ names)
+            case _:
+                found.append(ast.unparse(node))
+    return found
+
+
 def ids(path: Path) -> str:
     return str(path.relative_to(ROOT))
 
@@ -67,6 +89,20 @@ def test_core_imports_neither_mujoco_nor_upper_layers(path: Path) -> None:
     assert not offences(
         path.read_text(), "mujoco", "palm_jax.envs", "palm_jax.train", "flax", "optax", "h5py"
     )
+
+
+@pytest.mark.parametrize("path", CLIENT, ids=ids)
+def test_the_robots_side_imports_no_jax(path: Path) -> None:
+    names = {name.split(".")[0] for name in imported(path.read_text())}
+    others = names - set(sys.stdlib_module_names)
+    assert others <= {"msgpack", "numpy", "websockets", "palm_jax"}
+    ours = {name for name in imported(path.read_text()) if within(name, "palm_jax")}
+    assert ours <= {"palm_jax", "palm_jax.wire"}
+
+
+@pytest.mark.parametrize("path", DOORS, ids=ids)
+def test_doors_are_nothing_but_imports(path: Path) -> None:
+    assert beyond_a_door(path.read_text()) == []
 
 
 @pytest.mark.parametrize("path", ENVS, ids=ids)
@@ -92,6 +128,11 @@ def test_the_checks_see_an_offence() -> None:
     assert offences("def f():\n    from mujoco import mjx", "mujoco") == ["mujoco", "mujoco.mjx"]
     assert offences("import palm_jax.envs.base as b", "palm_jax.envs") == ["palm_jax.envs.base"]
     assert not offences("import trainer", "train")
+    door = "from palm_jax.train.x import a, b\n__all__ = ['a', 'b']\n"
+    assert beyond_a_door(door) == []
+    assert beyond_a_door(door + "c = 1") == ["c = 1"]
+    assert beyond_a_door(door.replace("'b'", "'c'")) == ["b", "c"]
+    assert beyond_a_door("from palm_jax.envs import make") == ["from palm_jax.envs import make"]
     assert WRITERS & set(calls("Path('x').write_text('y')")) == {"write_text"}
     with pytest.raises(AssertionError, match="relative import in line 1"):
         list(imported("from . import x"))

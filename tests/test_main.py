@@ -29,7 +29,7 @@ def verb(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 def test_help_lists_every_verb(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(words) == 0
     out = capsys.readouterr().out
-    for name in ("train", "sweep", "report", "show", "bench"):
+    for name in ("train", "sweep", "report", "show", "serve", "export", "bench"):
         assert f"\n  {name} " in out
 
 
@@ -42,7 +42,8 @@ def test_unknown_verb_lists_the_known_ones(capsys: pytest.CaptureFixture[str]) -
     assert cli.main(["tarin"]) == 2
     err = capsys.readouterr().err
     assert "unknown verb 'tarin'. Did you mean 'train'?" in err
-    assert "Known verbs: train, sweep, table, report, show, bench" in err
+    assert f"Known verbs: {', '.join(cli.VERBS)}" in err
+    assert {"train", "table", "data", "serve", "bench"} < set(cli.VERBS)
 
 
 def test_verb_gets_its_words_and_its_status_is_returned(
@@ -53,6 +54,17 @@ def test_verb_gets_its_words_and_its_status_is_returned(
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err == f"palm_jax {__version__}: report\n"
+
+
+def test_a_verb_says_which_extra_it_needs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "websockets", None)
+    monkeypatch.delitem(sys.modules, "palm_jax.train.serve", raising=False)
+    for name in [name for name in sys.modules if name.startswith("websockets.")]:
+        monkeypatch.delitem(sys.modules, name)
+    assert cli.main(["serve", "runs/demo"]) == 2
+    assert "serve needs websockets" in capsys.readouterr().err
 
 
 def test_bench_without_a_checkout_says_how_to_run_it(

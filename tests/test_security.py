@@ -301,11 +301,13 @@ def test_a_table_page_stays_a_table(tmp_path: Path) -> None:
     assert records.file_word("../../up/x y") == "-up-x-y" and records.file_word("lift_lid+a-1")
 
 
-def test_a_run_folder_decides_no_path(tmp_path: Path) -> None:
+def test_a_run_folder_decides_no_path() -> None:
     """`out` and `data` of a config.json are notes: commands get both from their own words."""
     readers = [path for path in SOURCES if "stored_config(" in path.read_text()]
     for path in readers:
+        if path.name == "workspace.py":  # makes it
+            continue
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Attribute) and dotted(node.value) == "stored":
+            if isinstance(node, ast.Attribute) and dotted(node.value) in ("stored", "config"):
                 assert node.attr not in ("out", "data", "backgrounds"), path
-    assert {path.name for path in readers} == {"workspace.py", "sweep.py"}
+    assert {path.name for path in readers} == {"workspace.py", "sweep.py", "policy.py"}

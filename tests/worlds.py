@@ -20,7 +20,12 @@ SPEC = AlignSpec(crop=200, offset=(0, 40), size=84)
 
 TASKS = ("lift_spam", "lift_lid")
 
-CASES = (("lift_spam", "panda"), ("lift_lid", "panda"), ("lift_spam", "ur5"))
+CASES = (
+    ("lift_spam", "panda"),
+    ("lift_lid", "panda"),
+    ("lift_spam", "ur5"),
+    ("lift_spam", "xarm7"),
+)
 """Tasks and robots whose experts are looked at."""
 
 

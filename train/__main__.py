@@ -11,31 +11,37 @@ from palm_jax._quiet import without_lines
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns 0, or 2 for a command that cannot be run, 130 when interrupted."""
     words = list(sys.argv[1:] if argv is None else argv)
-    if not any(word in ("-h", "--help") or word.startswith("--distributed") for word in words):
+    if not {"-h", "--help"} & set(words):
         print("palm_jax: loading JAX and MuJoCo ...", flush=True)
     warnings.filterwarnings("ignore", message=".*donated buffers were not usable.*")
     with without_lines():  # MJX's complaints about the missing warp back end
         from palm_jax.envs.rollout import StartPoseError
         from palm_jax.train import config as configuration
         from palm_jax.train import console as terminal
-        from palm_jax.train import devices, run
+        from palm_jax.train import devices, interrupts, run
         from palm_jax.train.demos import DemoFileError
+        from palm_jax.train.learner import NonFiniteError
+        from palm_jax.train.locks import Busy
+        from palm_jax.train.records import RecordError
 
     console = terminal.make_console()
     try:
         config = configuration.parse(words)
-        if config.distributed:
-            devices.connect(config.distributed)
-    except (configuration.ConfigError, devices.DeviceError) as error:
+    except configuration.ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     try:
-        run.execute(config, console)
+        with interrupts.raising():
+            run.execute(config, console)
     except (
-        configuration.ConfigError, devices.DeviceError, DemoFileError, StartPoseError
+        configuration.ConfigError, devices.DeviceError, DemoFileError, StartPoseError, RecordError,
+        Busy,
     ) as error:  # fmt: skip
         print(f"error: {error}", file=sys.stderr)
         return devices.leave(2)
+    except (NonFiniteError, MemoryError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return devices.leave(1)
     except KeyboardInterrupt as stop:
         if devices.is_first():
             terminal.interrupted(console, run.resume_command(config))

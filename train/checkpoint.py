@@ -49,6 +49,10 @@ SAVING = ".saving-"  # .saving-STEP-PID: being written, or left by a process tha
 REMOVING = ".removing-"  # being deleted: nothing in there is wanted
 SCORE = "score"
 """The entry of a checkpoint's meta data by which `prune` and `best` choose; larger is better."""
+FINGERPRINT = "config"
+"""The entry that says to which run's configuration a checkpoint belongs."""
+NEWEST = 2
+"""How many of the newest `prune` spares: should the last be damaged, little is lost."""
 
 _log = logging.getLogger(__name__)
 
@@ -94,7 +98,8 @@ def _describe(leaf: Any) -> dict[str, Any]:
     return {"dtype": str(leaf.dtype), "shape": [int(n) for n in leaf.shape]}
 
 
-def _nested(named: Mapping[str, Any]) -> dict[str, Any]:
+def nested(named: Mapping[str, Any]) -> dict[str, Any]:
+    """The tree of dictionaries in which leaves have these names."""
     tree: dict[str, Any] = {}
     for name, leaf in named.items():
         *folders, last = name.split("/")
@@ -169,7 +174,17 @@ def save(
 def _write_arrays(path: Path, named: Mapping[str, Any]) -> None:
     host = {name: np.asarray(leaf) for name, leaf in named.items()}
     # Orbax refuses arrays without elements; the manifest's shape and dtype say all about them.
-    tree = _nested({name: array for name, array in host.items() if array.size})
+    tree = nested({name: array for name, array in host.items() if array.size})
+    try:
+        _orbax_save(path, tree)
+    except OSError:
+        raise
+    except Exception as error:  # a full disk is a ValueError to Orbax, with a page of context
+        cause = str(error).rpartition(": ")[2]
+        raise OSError(f"{path.parent.parent}: the checkpoint cannot be written: {cause}") from error
+
+
+def _orbax_save(path: Path, tree: Mapping[str, Any]) -> None:
     if jax.process_count() == 1:
         ocp.save(path, tree)
         return
@@ -319,7 +334,9 @@ def steps(directory: str | Path) -> list[tuple[int, Path]]:
     return sorted(found)
 
 
-def latest_valid(directory: str | Path, *, repair: bool = True) -> tuple[int, Path] | None:
+def latest_valid(
+    directory: str | Path, *, repair: bool = True, fingerprint: str | None = None
+) -> tuple[int, Path] | None:
     """The newest checkpoint that is whole, as (step, folder), or None if there is none.
 
     Args:
@@ -327,13 +344,15 @@ def latest_valid(directory: str | Path, *, repair: bool = True) -> tuple[int, Pa
       repair: move damaged checkpoints, and those that a killed process left half-written, to
         `directory/damaged/STEP-REASON`, and log a warning for each. False only looks: for readers
         of a folder into which another process may be writing.
+      fingerprint: a checkpoint whose meta data have another `FINGERPRINT` is another run's, and
+        treated like a damaged one.
     """
     directory = Path(directory)
     if repair and directory.is_dir():
         _sweep_leftovers(directory)
     for step, path in reversed(steps(directory)):
         try:
-            verify(path)
+            _refuse_foreign(path, verify(path), fingerprint)
         except DamagedCheckpoint as damage:
             if repair:
                 _set_aside(path, f"{step}-{damage.reason}", str(damage))
@@ -342,17 +361,23 @@ def latest_valid(directory: str | Path, *, repair: bool = True) -> tuple[int, Pa
     return None
 
 
+def _refuse_foreign(path: Path, manifest: Mapping[str, Any], fingerprint: str | None) -> None:
+    found = manifest["meta"].get(FINGERPRINT)
+    if fingerprint is not None and found is not None and found != fingerprint:
+        raise DamagedCheckpoint(path, "foreign", "belongs to a run with other options")
+
+
 def _sweep_leftovers(directory: Path) -> None:
     for path in sorted(directory.glob(f"{SAVING}*")):
         step, _, pid = path.name.removeprefix(SAVING).partition("-")
-        if not _is_other_process(pid):
+        if not is_other_process(pid):
             _set_aside(path, f"{step}-unfinished", f"{path}: never completed (unfinished)")
     for path in directory.glob(f"{REMOVING}*"):
-        if not _is_other_process(path.name.rpartition("-")[2]):
+        if not is_other_process(path.name.rpartition("-")[2]):
             shutil.rmtree(path, ignore_errors=True)
 
 
-def _is_other_process(pid: str) -> bool:
+def is_other_process(pid: str) -> bool:
     """Whether a process of this number, not ours, is alive: it may still be writing."""
     if not pid.isdecimal() or int(pid) == os.getpid():
         return False
@@ -464,7 +489,7 @@ def read_meta(path: str | Path) -> dict[str, Any]:
     return _read_manifest(Path(path))["meta"]
 
 
-def fingerprint(path: str | Path) -> str:
+def content_hash(path: str | Path) -> str:
     """SHA-256 of what a checkpoint holds: equal for copies, whatever their meta data say."""
     manifest = _read_manifest(Path(path))
     return _digest({name: manifest[name] for name in ("step", "files", "leaves")})
@@ -477,17 +502,19 @@ def update_meta(path: str | Path, **values: Any) -> None:
     _write_manifest(path, {**manifest, "meta": {**manifest["meta"], **plain(values)}})
 
 
-def best(directory: str | Path, *, count: int = 1, score: str = SCORE) -> list[tuple[int, Path]]:
+def best(
+    directory: str | Path, *, count: int = 1, score: str = SCORE, fingerprint: str | None = None
+) -> list[tuple[int, Path]]:
     """Up to `count` whole checkpoints by falling score, the newer first among equals.
 
-    Those without a finite score are never among them.
+    Those without a finite score, and those of another `fingerprint`, are never among them.
     """
     ranked: list[tuple[int, Path]] = []
     for step, path in _ranked(Path(directory), score):
         if len(ranked) == count:
             break
         try:
-            verify(path)
+            _refuse_foreign(path, verify(path), fingerprint)
         except DamagedCheckpoint as damage:
             _log.warning("checkpoint passed over: %s", damage)
         else:
@@ -509,9 +536,9 @@ def _ranked(directory: Path, score: str) -> list[tuple[int, Path]]:
 
 
 def prune(directory: str | Path, *, keep: int, score: str = SCORE) -> list[int]:
-    """Delete all but the `keep` best by score and the newest; returns the deleted steps.
+    """Delete all but the `keep` best by score and the two newest; returns the deleted steps.
 
-    Without scores only the newest stays. Damaged checkpoints are not touched.
+    Without scores only the newest stay. Damaged checkpoints are not touched.
     """
     directory = Path(directory)
     if keep < 0:
@@ -524,7 +551,7 @@ def prune(directory: str | Path, *, keep: int, score: str = SCORE) -> list[int]:
             continue
         readable.append((step, path))
     spared = {step for step, _ in _ranked(directory, score)[:keep]}
-    spared |= {step for step, _ in readable[-1:]}
+    spared |= {step for step, _ in readable[-NEWEST:]}
     deleted = []
     for step, path in readable:
         if step not in spared:

@@ -11,6 +11,7 @@ Actions are what was commanded, so that jump is in none of them.
 """
 
 import dataclasses
+import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator
@@ -26,11 +27,15 @@ from palm_jax.align import AlignSpec, Camera
 from palm_jax.envs.base import PAPER_FRAME, Env, EnvParams, State
 from palm_jax.envs.expert import Demonstrator, Recording
 from palm_jax.envs.rollout import Runner, repeat_params, take_params
+from palm_jax.train import checkpoint
 
 FORMAT = "palm_jax-demos"
 VERSION = 2
 """2: frames have a stage, mocap poses begin with the distractors', and `env_params` has all that
 can shift now."""
+
+
+_DIGEST = "sha256"
 
 
 class DemoFileError(ValueError):
@@ -90,6 +95,9 @@ def collect(
     params = repeat_params(runner.env.default_params(), runner.worlds)
     root = jax.random.fold_in(jax.random.key(seed), 0xDE305)
     partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    for left in path.parent.glob(f".{path.name}.*.tmp"):
+        if not checkpoint.is_other_process(left.name.split(".")[-2]):
+            left.unlink()  # by a process that was killed
     kept = attempts = 0
     try:
         with h5py.File(partial, "w") as file:
@@ -112,10 +120,34 @@ def collect(
             else:
                 raise RuntimeError(f"the expert solved only {kept} of {attempts} scenes")
             _write_header(data, runner.env, seed=seed, noise=noise, attempts=attempts)
+            data.attrs[_DIGEST] = _digest(data)
+        with partial.open("rb") as written:
+            os.fsync(written.fileno())
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
     return path
+
+
+def _digest(data: h5py.Group) -> str:
+    """SHA-256 of every array and attribute: HDF5 does not notice a flipped bit."""
+    digest = hashlib.sha256()
+
+    def add(name: str, value: Any) -> None:
+        array = np.asarray(value)
+        content = repr(array.tolist()).encode() if array.dtype.kind in "OU" else array.tobytes()
+        digest.update(f"{name} {array.dtype} {array.shape} ".encode() + content)
+
+    def visit(name: str, item: Any) -> None:
+        for key in sorted(item.attrs):
+            if key != _DIGEST:
+                add(f"{name}@{key}", item.attrs[key])
+        if isinstance(item, h5py.Dataset):
+            add(name, item[()])
+
+    visit("", data)
+    data.visititems(visit)
+    return digest.hexdigest()
 
 
 def _write_demo(
@@ -203,7 +235,7 @@ def load(path: Path, *, task: str, robot: str, count: int | None = None) -> Demo
             return _read(file["data"], path, task, robot, count)
     except DemoFileError:
         raise
-    except (OSError, KeyError, RuntimeError, ValueError) as error:
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
         raise DemoFileError(
             f"{path} is not a whole demonstration file ({error}); move it away and collect again"
         ) from error
@@ -233,6 +265,10 @@ def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None
         if found != value:
             advice = "; move it away and collect again" if name == "version" else ""
             raise DemoFileError(f"{path}: expected {name} {value!r}, found {found!r}{advice}")
+    if _DIGEST in data.attrs and data.attrs[_DIGEST] != _digest(data):
+        raise DemoFileError(
+            f"{path}: the content differs from what was written; move it away and collect again"
+        )
     demos = [data[f"demo_{i}"] for i in range(len(data))]
     if count is not None:
         if len(demos) < count:

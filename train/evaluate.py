@@ -1,9 +1,8 @@
 """Success of a policy in every domain: all scenes of a domain in one vmapped rollout."""
 
 import dataclasses
-import functools
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import jax
 import numpy as np
@@ -13,7 +12,7 @@ from palm_jax.envs.base import EnvParams, State
 from palm_jax.envs.rollout import Act, Episodes, Runner, take_params
 from palm_jax.envs.tasks import Task
 from palm_jax.train import devices
-from palm_jax.train.learner import Learner, PolicyState
+from palm_jax.train.learner import NOISE_ROWS, Learner, PolicyState
 from palm_jax.train.methods import Method
 from palm_jax.train.records import DomainRecord
 
@@ -27,31 +26,87 @@ class Runners:
     """One task on two robots: the one of the demonstrations, and that of `embodiment` domains.
 
     A robot's `Runner` is made when it is first asked for, which takes most of a minute to compile,
-    and kept: methods share it.
+    and kept: methods share it. One whose worlds do not fit into memory is replaced by one of half
+    as many.
     """
 
-    def __init__(self, make: Callable[[str], Runner], robot: str, other: str) -> None:
-        """`make` gives a robot's runner; all have the same task and number of worlds."""
+    def __init__(
+        self,
+        make: Callable[[str], Runner],
+        robot: str,
+        other: str,
+        *,
+        tell: Callable[[str], None] | None = None,
+    ) -> None:
+        """`make` gives a robot's runner; all have the same task and number of worlds. `tell` is
+        called with a sentence when that number had to be lowered."""
         self.robot, self.other = robot, other
-        self._make = functools.cache(make)
+        self._make, self._tell = make, tell
+        self._made: dict[str, Runner] = {}
 
     @classmethod
-    def of(cls, task: str, robot: str, other: str, worlds: int) -> "Runners":
+    def of(
+        cls,
+        task: str,
+        robot: str,
+        other: str,
+        worlds: int,
+        *,
+        tell: Callable[[str], None] | None = None,
+    ) -> "Runners":
         """The runners of a task and two robots by name, `worlds` worlds a batch, which this
         process's devices share."""
         found = devices.local_for(worlds)
-        return cls(
-            lambda name: Runner(registry.make(task, name), worlds, devices=found), robot, other
-        )
+
+        def make(name: str) -> Runner:
+            return Runner(registry.make(task, name), worlds, devices=found)
+
+        return cls(make, robot, other, tell=tell)
+
+    def of_robot(self, robot: str) -> Runner:
+        """The one of a robot."""
+        if robot not in self._made:
+            self._made[robot] = self._make(robot)
+        return self._made[robot]
 
     @property
     def first(self) -> Runner:
         """That of the robot that the demonstrations are of."""
-        return self._make(self.robot)
+        return self.of_robot(self.robot)
+
+    def plays(self, domain: str) -> str:
+        """The robot of a domain."""
+        return self.other if shifts.other_robot(domain) else self.robot
 
     def domain(self, domain: str) -> Runner:
         """The one that plays a domain."""
-        return self._make(self.other if shifts.other_robot(domain) else self.robot)
+        return self.of_robot(self.plays(domain))
+
+    @property
+    def worlds(self) -> dict[str, int]:
+        """Worlds in a batch, of every robot that has a runner."""
+        return {robot: runner.worlds for robot, runner in self._made.items()}
+
+    def halve(self, robot: str, why: str) -> None:
+        """Go on with half as many worlds.
+
+        Raises:
+          MemoryError: there is but one.
+        """
+        runner = self._made[robot]
+        if runner.worlds == 1:
+            raise MemoryError(f"not even one world of {robot} fits into memory: {why}")
+        self._made[robot] = runner.halved()
+        if self._tell:
+            self._tell(
+                f"{runner.worlds} worlds of {robot} do not fit into memory; going on with "
+                f"{self._made[robot].worlds} at a time ({why})"
+            )
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Whether XLA failed to allocate."""
+    return "RESOURCE_EXHAUSTED" in str(error)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,10 +127,79 @@ class Evaluator:
     def task(self) -> Task:
         return self.runner.env.task
 
-    def act(self, policy: PolicyState) -> Act:
-        """The policy as a function of a batch of observations."""
+    def act(self, policy: PolicyState, rows: np.ndarray | None = None) -> Act:
+        """The policy as a function of a batch of observations; `rows`: see `Learner.act`."""
         act = self.learner.jitted_act
-        return lambda key, image, proprio: act(key, policy, {VIEW: image}, proprio)
+        return lambda key, image, proprio: act(key, policy, {VIEW: image}, proprio, rows)
+
+    def batches(
+        self,
+        policy: PolicyState,
+        scenes: jax.Array,
+        params: EnvParams,
+        count: int,
+        *,
+        robot: str | None = None,
+        first: int = 0,
+        watch: Watch | None = None,
+    ) -> Iterator[tuple[np.ndarray, Episodes]]:
+        """The episodes `first` to `count`, batch by batch in order, each with its rows.
+
+        Scene i depends on (`scenes`, i) and its params alone: another size of the batches changes
+        rounding, and nothing else. A batch that does not fit into memory is tried again with half
+        as many worlds.
+
+        Args:
+          policy: from `Learner.policy_state`.
+          scenes: key of the scenes.
+          params: leading axis [count].
+          count: any number; batches of the runner's size, the last one filled up and cut.
+          robot: who acts; by default the one of the demonstrations.
+          first: where to begin.
+          watch: shown every state of the first batch.
+
+        Raises:
+          MemoryError: not even one world fits.
+        """
+        robot = robot or self.runners.robot
+        while first < count:
+            worlds = self.runners.of_robot(robot).worlds
+            # The policy's noise comes in tables of so many rows, and a batch reads one of them.
+            table = first - first % NOISE_ROWS
+            rows = np.arange(first, min(first + worlds, count, table + NOISE_ROWS))
+            try:
+                found = self._batch(policy, scenes, params, rows, robot, watch)
+            except jax.errors.JaxRuntimeError as error:
+                if not out_of_memory(error):
+                    raise
+                self.runners.halve(robot, str(error).partition("\n")[0])
+            else:
+                yield rows, found
+                first, watch = first + len(rows), None
+
+    def _batch(
+        self,
+        policy: PolicyState,
+        scenes: jax.Array,
+        params: EnvParams,
+        rows: np.ndarray,
+        robot: str,
+        watch: Watch | None,
+    ) -> Episodes:
+        """The episodes of consecutive rows, at most as many as the runner has worlds."""
+        runner = self.runners.of_robot(robot)
+        table = int(rows[0]) - int(rows[0]) % NOISE_ROWS
+        every = np.arange(rows[0], rows[0] + runner.worlds)
+        found = runner.run(
+            jax.random.fold_in(scenes, 2**31 + table),
+            jax.vmap(lambda i: jax.random.fold_in(scenes, i))(every),
+            take_params(params, np.minimum(every, rows[-1])),
+            self.act(policy, np.minimum(every - table, NOISE_ROWS - 1)),
+            self.method.spec(self.task, self.image_size),
+            frame=self.method.frame,
+            watch=watch,
+        )
+        return jax.tree.map(lambda field: np.asarray(field)[: len(rows)], found)
 
     def episodes(
         self,
@@ -84,39 +208,15 @@ class Evaluator:
         params: EnvParams,
         count: int,
         *,
-        runner: Runner | None = None,
+        robot: str | None = None,
         watch: Watch | None = None,
     ) -> Episodes:
-        """`count` episodes; scene i depends on (`scenes`, i) and its params alone.
-
-        Args:
-          policy: from `Learner.policy_state`.
-          scenes: key of the scenes.
-          params: leading axis [count].
-          count: any number; batches of the runner's size, the last one filled up and cut.
-          runner: the world; by default `self.runner`.
-          watch: shown every state of the first batch.
-        """
-        runner = runner or self.runner
-        spec, worlds = self.method.spec(self.task, self.image_size), runner.worlds
-        parts = []
-        for first in range(0, count, worlds):
-            rows = np.arange(first, first + worlds)
-            keys = jax.vmap(lambda i: jax.random.fold_in(scenes, i))(rows)
-            batch = take_params(params, np.minimum(rows, count - 1))
-            noise = jax.random.fold_in(scenes, 2**31 + first)
-            parts.append(
-                runner.run(
-                    noise,
-                    keys,
-                    batch,
-                    self.act(policy),
-                    spec,
-                    frame=self.method.frame,
-                    watch=watch if first == 0 else None,
-                )
-            )
-        return jax.tree.map(lambda *fields: np.concatenate(fields)[:count], *parts)
+        """`count` episodes at once; see `batches`."""
+        parts = [
+            found
+            for _, found in self.batches(policy, scenes, params, count, robot=robot, watch=watch)
+        ]
+        return jax.tree.map(lambda *fields: np.concatenate(fields), *parts)
 
     def domain(
         self,
@@ -130,8 +230,8 @@ class Evaluator:
     ) -> DomainRecord:
         """`count` scenes of a domain; the same scenes for every method and policy."""
         params = self.scenes(domain, seed=seed, count=count, aligned=aligned)
-        scenes, runner = scene_key(seed, domain), self.runners.domain(domain)
-        return record(self.episodes(policy, scenes, params, count, runner=runner, watch=watch))
+        scenes, robot = scene_key(seed, domain), self.runners.plays(domain)
+        return record(self.episodes(policy, scenes, params, count, robot=robot, watch=watch))
 
     def scenes(self, domain: str, *, seed: int, count: int, aligned: bool) -> EnvParams:
         """Params of a domain's scenes, leading axis [count]; with the robot that plays it.

@@ -16,7 +16,10 @@ FULL_SIZE = 224
 
 
 class Trace:
-    """Joint positions of W worlds over an episode; call it with every state."""
+    """Joint positions of W worlds over an episode; call it with every state.
+
+    Another number of worlds begins a new one: the batch did not fit into memory.
+    """
 
     def __init__(self) -> None:
         self.qpos: list[np.ndarray] = []
@@ -24,6 +27,8 @@ class Trace:
         self.last: State | None = None
 
     def __call__(self, state: State) -> None:
+        if self.qpos and len(self.qpos[0]) != len(state.data.qpos):
+            self.qpos, self.solved = [], []
         self.qpos.append(np.asarray(state.data.qpos))
         self.solved.append(np.asarray(state.success))
         self.last = state

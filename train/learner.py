@@ -40,6 +40,7 @@ GRIPPER = 9
 GRIPPER_THRESHOLD = 0.5  # of the denormalised prediction; above is open
 IMAGE_MEAN = (0.485, 0.456, 0.406)  # ImageNet, RGB in [0, 1]
 IMAGE_STD = (0.229, 0.224, 0.225)
+NOISE_ROWS = 4096  # samples that `act` has different noise for under one key
 CONSTANT_RANGE = 1e-7  # a dimension that varies less is a constant, and maps to 0
 SCHEDULES = ("constant", "cosine")
 DTYPES = ("float32", "bfloat16")
@@ -50,6 +51,16 @@ CPU_OPTIONS: dict[str, Any] = {"xla_cpu_experimental_ynn_fusion_type": ""}
 
 class NonFiniteError(FloatingPointError):
     """More steps had a non-finite loss or gradient than the configuration lets pass."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Failure:
+    """A step whose loss or gradient is not finite, with all that it is computed from."""
+
+    key: jax.Array
+    state: "TrainState"  # before the step, whose number it holds
+    batch: "Batch"
+    bank: jax.Array | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -341,6 +352,12 @@ def _optimizer(config: LearnerConfig) -> optax.GradientTransformation:
     return optax.chain(*parts)
 
 
+def _by_name(tree: Any) -> dict[str, jax.Array]:
+    """ "state/params/head/bias" -> leaf."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+
+
 def _flatten(params: model.Params) -> jax.Array:
     """All parameters as one vector [n], the encoders' first.
 
@@ -404,14 +421,7 @@ class Learner:
           `update_norm`, `learning_rate`, `skipped` (updates left out so far).
         """
         check_batch(batch, self.proprio_dim, self.views, self.config.crop)
-        image_key, proprio_key = jax.random.split(jax.random.fold_in(key, state.step))
-        if self.config.turns:
-            _check_cameras(batch, self.views)
-            turn_key = jax.random.fold_in(image_key, len(self.views))
-            batch = _turned_views(turn_key, batch, self.views[0], self.config)
-        images = _random_views(image_key, batch.images, bank, state.step, self.config)
-        proprio = self._noisy_proprio(proprio_key, state.normalizer, jnp.asarray(batch.proprio))
-        target = state.normalizer.action.normalize(jnp.asarray(batch.actions))
+        images, proprio, target = self._inputs(key, state, batch, bank)
 
         def loss_of(params: model.Params) -> tuple[jax.Array, model.Params]:
             prediction, _, stats = self._network.apply(
@@ -421,6 +431,28 @@ class Learner:
 
         (loss, stats), grads = jax.value_and_grad(loss_of, has_aux=True)(state.params)
         return self._updated(state, loss, stats, _flatten(grads))
+
+    def examine(self, failure: Failure) -> dict[str, jax.Array]:
+        """Everything that a step computes, by name and in that order: what it is given, what the
+        augmentation makes of it, every layer, the loss, the gradient."""
+        key, state, batch, bank = failure.key, failure.state, failure.batch, failure.bank
+        out = _by_name({"state": state, "batch": batch, "bank": bank})
+        images, proprio, target = self._inputs(key, state, batch, bank)
+        out |= _by_name({"input": {"images": images, "proprio": proprio, "target": target}})
+
+        names: list[str] = []  # JAX would sort a dictionary's entries
+
+        def loss_of(params: model.Params) -> tuple[jax.Array, list[jax.Array]]:
+            prediction, layers, _ = self._network.apply(
+                params, state.batch_stats, images, proprio, train=True
+            )
+            names[:] = layers
+            return mean_squared_error(prediction, target), [*layers.values(), prediction]
+
+        (loss, layers), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params)
+        out |= {f"layer {name}": value for name, value in zip(names, layers, strict=False)}
+        out |= {"prediction": layers[-1], "loss": loss}
+        return out | _by_name({"gradient": gradient})
 
     def predict(
         self, policy: PolicyState, images: Mapping[str, jax.Array], proprio: jax.Array
@@ -437,6 +469,7 @@ class Learner:
         policy: PolicyState,
         images: Mapping[str, jax.Array],
         proprio: jax.Array,
+        rows: ArrayLike | None = None,
     ) -> jax.Array:
         """Actions [B, 10] in their own units: a rotation of two orthonormal columns, metres, and a
         gripper of exactly 0 or 1.
@@ -446,8 +479,11 @@ class Learner:
           policy: from `policy_state`.
           images: view -> [B, H, W, 3] uint8.
           proprio: [B, P].
+          rows: [B] int below `NOISE_ROWS`, which noise of those that the key stands for each sample
+            gets; by default 0 to B - 1. With it a sample's noise does not depend on its batch.
         """
-        noisy = self._noisy_proprio(key, policy.normalizer, jnp.asarray(proprio))
+        chosen = None if rows is None else jnp.asarray(rows)
+        noisy = self._noisy_proprio(key, policy.normalizer, jnp.asarray(proprio), chosen)
         prediction, _ = self._output(policy, images, noisy)
         return to_action(policy.normalizer.action.denormalize(prediction))
 
@@ -510,6 +546,20 @@ class Learner:
             dtype=jnp.dtype(config.dtype),
         )
 
+    def _inputs(
+        self, key: jax.Array, state: TrainState, batch: Batch, bank: jax.Array | None
+    ) -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
+        """(images, proprioception, target) of a step: augmented and normalised."""
+        image_key, proprio_key = jax.random.split(jax.random.fold_in(key, state.step))
+        if self.config.turns:
+            _check_cameras(batch, self.views)
+            turn_key = jax.random.fold_in(image_key, len(self.views))
+            batch = _turned_views(turn_key, batch, self.views[0], self.config)
+        images = _random_views(image_key, batch.images, bank, state.step, self.config)
+        proprio = self._noisy_proprio(proprio_key, state.normalizer, jnp.asarray(batch.proprio))
+        target = state.normalizer.action.normalize(jnp.asarray(batch.actions))
+        return images, proprio, target
+
     def _updated(
         self, state: TrainState, loss: jax.Array, stats: model.Params, gradient: jax.Array
     ) -> tuple[TrainState, dict[str, jax.Array]]:
@@ -560,10 +610,18 @@ class Learner:
         return jnp.where(jnp.arange(sum(sizes.values())) < sizes["encoders"], scale, 1.0)
 
     def _noisy_proprio(
-        self, key: jax.Array, normalizer: Normalizer, proprio: jax.Array
+        self,
+        key: jax.Array,
+        normalizer: Normalizer,
+        proprio: jax.Array,
+        rows: jax.Array | None = None,
     ) -> jax.Array:
         x = normalizer.proprio.normalize(proprio)
-        return x + self.config.proprio_noise * jax.random.normal(key, x.shape, x.dtype)
+        if rows is None:
+            noise = jax.random.normal(key, x.shape, x.dtype)
+        else:
+            noise = jax.random.normal(key, (NOISE_ROWS, *x.shape[1:]), x.dtype)[rows]
+        return x + self.config.proprio_noise * noise
 
     def _output(
         self, policy: PolicyState, images: Mapping[str, jax.Array], proprio: jax.Array
@@ -710,6 +768,7 @@ def run(
     on_checkpoint: Callable[[int, TrainState], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
     devices: Sequence[jax.Device] | None = None,
+    on_failure: Callable[[Failure], None] | None = None,
 ) -> TrainState:
     """Train up to `steps`, and return the state.
 
@@ -730,6 +789,7 @@ def run(
       devices: those that share every batch, the default device alone by default. With those of
         several processes each of them makes this call, with the same arguments; `state` and
         `bank` count on the first only. States that are handed out are on one device.
+      on_failure: given a step to look at, before `NonFiniteError` is raised.
 
     Raises:
       DeviceError: the devices do not divide the batch.
@@ -767,6 +827,9 @@ def run(
             numbers = {name: float(value) for name, value in metrics.items()}
             if on_log:
                 on_log(done, numbers)
+            if on_failure and int(numbers["skipped"]) > config.max_skipped_steps:
+                alone = split.on_one(state), split.on_one(backgrounds)
+                on_failure(_find_failure(learner, keys, alone[0], data, alone[1], log_every))
             check_skipped(int(numbers["skipped"]), done, config)
         if on_checkpoint and checkpoint_every and done % checkpoint_every == 0:
             on_checkpoint(done, split.on_one(state))
@@ -776,6 +839,35 @@ def run(
     if on_checkpoint and checkpoint_every and saved != done:
         on_checkpoint(done, state)
     return state
+
+
+def _find_failure(
+    learner: Learner,
+    keys: RunKeys,
+    state: TrainState,
+    data: Batch,
+    bank: jax.Array | None,
+    back: int,
+) -> Failure:
+    """The last of the `back` steps before this state that fails with it.
+
+    A skipped step leaves the parameters as they are, so that the last step, if it was one, is
+    repeated exactly. An earlier one is tried with the parameters of today: bad data stay bad. If
+    none fails, the last step is given.
+    """
+    done, count = int(state.step), len(data.proprio)
+    found: Failure | None = None
+    for step in range(done - 1, max(done - 1 - back, -1), -1):
+        batch = take(data, batch_indices(keys.order, step, count, learner.config.batch_size))
+        before = dataclasses.replace(state, step=jnp.int32(step))
+        tried = Failure(keys.step, before, batch, bank)
+        # A copy, which the step consumes.
+        _, metrics = learner.jitted_step(keys.step, jax.tree.map(jnp.copy, before), batch, bank)
+        if not np.isfinite([float(metrics["loss"]), float(metrics["grad_norm"])]).all():
+            return tried
+        found = found or tried
+    assert found is not None
+    return found
 
 
 def check_skipped(skipped: int, step: int, config: LearnerConfig) -> None:

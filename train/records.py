@@ -14,10 +14,9 @@ names the file and the problem.
 import io
 import json
 import re
+import struct
 import warnings
-import zipfile
-import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -62,6 +61,7 @@ class Sweep:
     ys: NDArray[np.float64]  # [Y] metres, cell centres
     success: NDArray[np.bool_]  # [A, X, Y, S]
     nan: NDArray[np.bool_]  # [A, X, Y, S]
+    worlds: int = 0  # in a batch at the end; 0: not recorded
 
     @property
     def solved(self) -> NDArray[np.bool_]:
@@ -77,12 +77,16 @@ class StrengthSweep:
     strengths: NDArray[np.float64]  # [K]
     success: NDArray[np.bool_]  # [K, S]
     nan: NDArray[np.bool_]  # [K, S]
+    worlds: int = 0  # in a batch at the end; 0: not recorded
 
     @property
     def solved(self) -> NDArray[np.bool_]:
         """[K, S] successes that count: a non-finite episode never does."""
         return self.success & ~self.nan
 
+
+_ZIP_END = struct.Struct("<4s4H2LH")
+"""The end of a ZIP file: signature, disks, entries (twice), the directory's size and start."""
 
 _DTYPES: dict[str, Any] = {
     "success": np.bool_,
@@ -100,6 +104,7 @@ def domain_record(values: Mapping[str, ArrayLike], *, where: str = "record") -> 
     `draws` may be missing: it was not always recorded.
     """
     values = {"draws": np.zeros(np.shape(values.get("success", ())), np.int32), **values}
+    _refuse_unknown(where, values, _DTYPES)
     missing = sorted(set(_DTYPES) - set(values))
     if missing:
         raise RecordError(f"{where}: missing {', '.join(missing)}; expected {', '.join(_DTYPES)}")
@@ -113,6 +118,13 @@ def domain_record(values: Mapping[str, ArrayLike], *, where: str = "record") -> 
                 f"got {array.shape}"
             )
     return DomainRecord(**arrays)
+
+
+def _refuse_unknown(where: object, found: Iterable[str], known: Iterable[str]) -> None:
+    """A name that is not ours may be one of ours, damaged, and its array be taken for absent."""
+    unknown = sorted(set(found) - set(known))
+    if unknown:
+        raise RecordError(f"{where}: unknown {', '.join(unknown)}; expected {', '.join(known)}")
 
 
 def joined(parts: Sequence[DomainRecord]) -> DomainRecord:
@@ -137,8 +149,8 @@ def counts(records: Mapping[str, DomainRecord]) -> dict[str, dict[str, int]]:
     }
 
 
-def write_arrays(path: Path, arrays: Mapping[str, ArrayLike]) -> Path:
-    """Write an .npz file, whole or not at all; nothing in it is pickled."""
+def save_arrays(path: Path, arrays: Mapping[str, ArrayLike]) -> Path:
+    """Write an .npz file, whole or not at all."""
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, **arrays)
     return write_atomic(path, content.getvalue())
@@ -159,12 +171,12 @@ def save_eval(path: Path, records: Mapping[str, Mapping[str, ArrayLike] | Domain
             record = domain_record(values, where=domain)
         for field in fields(record):
             arrays[f"{domain}/{field.name}"] = getattr(record, field.name)
-    return write_arrays(path, arrays)
+    return save_arrays(path, arrays)
 
 
 def save_sweep(path: Path, sweep: Sweep) -> Path:
     """Write sweep.npz, whole or not at all."""
-    return write_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
+    return save_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
 
 
 def sweep_path(folder: Path, robot: str = "", *, shift: str = "") -> Path:
@@ -192,13 +204,14 @@ def swept_robot(path: Path) -> str:
 
 def save_strengths(path: Path, sweep: StrengthSweep) -> Path:
     """Write a `StrengthSweep`, whole or not at all."""
-    return write_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
+    return save_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
 
 
 def load_strengths(path: Path) -> StrengthSweep:
     """Read a `StrengthSweep`."""
     arrays = load_arrays(path)
-    missing = {field.name for field in fields(StrengthSweep)} - set(arrays)
+    _refuse_unknown(path, arrays, [field.name for field in fields(StrengthSweep)])
+    missing = {field.name for field in fields(StrengthSweep)} - {"worlds", *arrays}
     if missing:
         raise RecordError(f"{path}: missing {', '.join(sorted(missing))}")
     strengths = np.atleast_1d(arrays["strengths"]).astype(float)
@@ -208,17 +221,42 @@ def load_strengths(path: Path) -> StrengthSweep:
             f"{path}: expected success and nan of shape [{len(strengths)}, S], "
             f"got {success.shape} and {nan.shape}"
         )
-    return StrengthSweep(str(arrays["shift"]), strengths, success, nan)
+    return StrengthSweep(str(arrays["shift"]), strengths, success, nan, worlds_of(arrays))
+
+
+def worlds_of(arrays: Mapping[str, NDArray[Any]]) -> int:
+    """Worlds in a batch at the end of a sweep, 0 if they were not recorded."""
+    found = arrays.get("worlds", np.zeros((), int))
+    return int(found) if found.shape == () and found.dtype.kind in "iu" else 0
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Read an .npz file; raises RecordError, and never unpickles."""
+    """Read an .npz file without pickles."""
     try:
+        content = path.read_bytes()
         # From memory: NumPy leaves a file that it cannot read open.
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            _check_directory(content, len(archive.files))
             return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+    except Exception as error:  # damaged bytes make zipfile and NumPy raise whatever comes to mind
         raise RecordError(f"{path}: not a readable .npz file ({error})") from error
+
+
+def _check_directory(content: bytes, count: int) -> None:
+    """Raises ValueError for an archive whose directory hides some of its arrays.
+
+    Every array has a checksum, but the directory has none: a byte of it can make an entry swallow
+    the next ones, and zipfile does not compare what it found with the number at the end.
+    """
+    end = content[-_ZIP_END.size :]
+    if len(end) < _ZIP_END.size:
+        raise ValueError("it ends early")
+    signature, _, _, _, entries, size, start, _ = _ZIP_END.unpack(end)
+    large = entries == 0xFFFF  # then the number is elsewhere
+    if signature != b"PK\x05\x06" or not (
+        large or (entries == count and start + size + _ZIP_END.size == len(content))
+    ):
+        raise ValueError("its directory is damaged")
 
 
 def load_eval(path: Path) -> dict[str, DomainRecord]:
@@ -237,6 +275,7 @@ def load_eval(path: Path) -> dict[str, DomainRecord]:
 def load_sweep(path: Path) -> Sweep:
     """Read sweep.npz."""
     arrays = load_arrays(path)
+    _refuse_unknown(path, arrays, [field.name for field in fields(Sweep)])
     missing = {"angles", "xs", "ys", "success"} - set(arrays)
     if missing:
         raise RecordError(f"{path}: missing {', '.join(sorted(missing))}")
@@ -250,7 +289,7 @@ def load_sweep(path: Path) -> Sweep:
                 f"{path}: {name}: expected shape [angles, xs, ys, episodes] = {grid} + (S,), "
                 f"got {array.shape}"
             )
-    return Sweep(angles, xs, ys, success, nan)
+    return Sweep(angles, xs, ys, success, nan, worlds_of(arrays))
 
 
 def load_json(path: Path) -> dict[str, Any]:
@@ -279,6 +318,23 @@ def load_counts(path: Path) -> dict[str, dict[str, int]]:
             raise RecordError(f"{path}: {domain}: impossible counts {entry!r}")
         result[domain] = {"successes": good, "episodes": total, "nan": nan}
     return result
+
+
+def check_counts(path: Path, episodes: Mapping[str, DomainRecord]) -> None:
+    """Check that the counts of an eval.json are those of the episodes beside it.
+
+    JSON has no checksum: a digit that was changed is found in this way.
+
+    Raises:
+      RecordError: they differ; the domain is named.
+    """
+    stored, counted = load_counts(path), counts(episodes)
+    for domain in {**stored, **counted}:
+        if stored.get(domain) != counted.get(domain):
+            raise RecordError(
+                f"{path}: {domain}: {stored.get(domain)}, but the episodes in the .npz file beside "
+                f"it count {counted.get(domain)}"
+            )
 
 
 def load_metrics(path: Path) -> tuple[list[dict[str, Any]], list[str]]:

@@ -1,7 +1,7 @@
 """The main job: demonstrations, then training and evaluation of each method, a report."""
 
 import dataclasses
-import signal
+import os
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -17,11 +17,14 @@ from palm_jax.envs import physics, shifts
 from palm_jax.envs.rollout import Runner
 from palm_jax.train import (
     checkpoint,
+    debug,
     demos,
     devices,
     figures,
     films,
+    interrupts,
     learner,
+    locks,
     methods,
     pictures,
     records,
@@ -39,6 +42,7 @@ from palm_jax.train.metrics import MetricsLog, write_json
 _FILMED = ("workspace+viewpoint", "workspace+viewpoint+embodiment")
 """Domains of which videos are made, where they are evaluated."""
 
+_PROMISE = "Stopping after this update, which saves; once more ends at once."
 _LOG_EVERY = 25  # updates
 _BANK = 128  # background textures for Random Overlay
 _TRANSFORM_KEY = 1 << 20  # apart from the keys of the demonstrations
@@ -47,32 +51,6 @@ _SELECTION_SEED = 500  # scenes that score checkpoints: never those of the evalu
 
 class Interrupted(KeyboardInterrupt):
     """Stopped on request, with everything saved."""
-
-
-class Stop:
-    """Ctrl-C and SIGTERM: the first asks for an orderly end, the second ends at once."""
-
-    def __init__(self) -> None:
-        self.asked = False
-
-    def __call__(self) -> bool:
-        return self.asked
-
-    @contextmanager
-    def listening(self) -> Iterator[None]:
-        """While training: a signal sets the flag, which is looked at between two steps."""
-
-        def note(number: int, frame: Any) -> None:
-            if self.asked:
-                raise KeyboardInterrupt
-            self.asked = True
-
-        before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
 
 
 def execute(config: Config, console: Console) -> Path:
@@ -85,15 +63,22 @@ def execute(config: Config, console: Console) -> Path:
       DeviceError: the devices do not divide the batch.
       DemoFileError: the demonstrations cannot be used.
       StartPoseError: a domain asks for start poses that an arm cannot take.
+      RecordError: a file of the folder is damaged.
+      Busy: another process works in the folder.
       Interrupted: stopped on request.
     """
-    start = time.monotonic()
     out = config.out or default_out(config)
     config = dataclasses.replace(config, out=out)
     devices.Split.over(jax.devices()).check(config.batch_size)
     if not devices.is_first():
         _take_part(config)
         return out
+    with locks.claim(out):
+        return _execute(config, out, console)
+
+
+def _execute(config: Config, out: Path, console: Console) -> Path:
+    start = time.monotonic()
     folders = {name: out / name if len(config.method) > 1 else out for name in config.method}
     for name, folder in folders.items():
         workspace.begin(config, folder, name)
@@ -109,7 +94,13 @@ def execute(config: Config, console: Console) -> Path:
             "folder": out,
         },
     )
-    runners = Runners.of(config.task, config.robot, config.second_robot, _worlds(config))
+    runners = Runners.of(
+        config.task,
+        config.robot,
+        config.second_robot,
+        _worlds(config),
+        tell=lambda text: console.print(text, style="bold", markup=False),
+    )
     # One for each method throughout: what it has compiled, it keeps.
     evaluators = {
         name: workspace.make_evaluator(config, methods.find(name), runners) for name in folders
@@ -119,10 +110,10 @@ def execute(config: Config, console: Console) -> Path:
     for name, folder in folders.items():
         began = time.monotonic()
         _one_method(config, evaluators[name], data, folder, console)
-        _note_environment(config, folder, time.monotonic() - began)
+        _note_environment(config, folder, time.monotonic() - began, runners.worlds)
     if config.sweep:
         _sweeps(evaluators, folders, console)
-    _gallery(folders, out)
+    _gallery(folders, out, console)
     report.write_report(out)
     counts = {name: records.load_counts(folder / "eval.json") for name, folder in folders.items()}
     if len(folders) > 1:
@@ -153,7 +144,7 @@ def _take_part(config: Config) -> None:
 
 
 def _share_training(config: Config, evaluator: Evaluator, data: learner.Batch) -> None:
-    stop = Stop()
+    stop = interrupts.Stop(_PROMISE)
     together = devices.Together(stop)
     with stop.listening():
         learner.run(
@@ -165,6 +156,7 @@ def _share_training(config: Config, evaluator: Evaluator, data: learner.Batch) -
             checkpoint_every=config.checkpoint_every,
             on_checkpoint=lambda step, state: devices.wait(),
             should_stop=together,
+            on_failure=lambda failure: devices.wait(),
             devices=jax.devices(),
         )
     if together.agreed:
@@ -183,10 +175,21 @@ def _worlds(config: Config) -> int:
     return config.scenes if config.scenes <= limit else limit // 2
 
 
-def _note_environment(config: Config, folder: Path, wall_s: float) -> None:
+def _note_environment(
+    config: Config, folder: Path, wall_s: float, worlds: Mapping[str, int]
+) -> None:
     path = folder / "env.json"
-    earlier = records.load_json(path).get("wall_s", 0.0) if path.exists() else 0.0
-    write_json(path, workspace.environment(config, wall_s=earlier + wall_s))
+    earlier = _noted(path).get("wall_s", 0.0)
+    found = workspace.environment(config, wall_s=earlier + wall_s)
+    write_json(path, {**found, "worlds": dict(worlds)})
+
+
+def _noted(path: Path) -> dict[str, Any]:
+    """What a file of notes holds, nothing if it is absent or damaged: no result rests on it."""
+    try:
+        return records.load_json(path)
+    except records.RecordError:
+        return {}
 
 
 def _demonstration_file(config: Config) -> Path:
@@ -196,27 +199,38 @@ def _demonstration_file(config: Config) -> Path:
 
 def _demonstrations(config: Config, runner: Runner, console: Console) -> demos.Demos:
     path = _demonstration_file(config)
+
+    def waiting() -> None:
+        console.print(f"Waiting for another process that makes {path}")
+
+    # Runs that share a file make it once. One that exists is read, whoever may write there.
     if not path.exists():
-        with terminal.ProgressBar(console, config.demos, "demonstrate", unit="demo") as bar:
-            done = 0
-
-            def progress(kept: int) -> None:
-                nonlocal done
-                bar.advance(kept - done)
-                done = kept
-
-            demos.collect(
-                runner,
-                path,
-                count=config.demos,
-                seed=config.demo_seed,
-                noise=config.demo_noise,
-                progress=progress,
-            )
+        with locks.locked(path, waiting=waiting):
+            if not path.exists():
+                _collect(config, runner, path, console)
     data = demos.load(path, task=config.task, robot=config.robot, count=config.demos)
     text = ", ".join(f"{value} {name}" for name, value in demos.summary(data).items())
     console.print(f"Demonstrations: {text}")
     return data
+
+
+def _collect(config: Config, runner: Runner, path: Path, console: Console) -> None:
+    with terminal.ProgressBar(console, config.demos, "demonstrate", unit="demo") as bar:
+        done = 0
+
+        def progress(kept: int) -> None:
+            nonlocal done
+            bar.advance(kept - done)
+            done = kept
+
+        demos.collect(
+            runner,
+            path,
+            count=config.demos,
+            seed=config.demo_seed,
+            noise=config.demo_noise,
+            progress=progress,
+        )
 
 
 def _one_method(
@@ -227,7 +241,7 @@ def _one_method(
     console: Console,
 ) -> None:
     method = evaluator.method
-    if devices.from_first((folder / "eval.json").exists()):
+    if devices.from_first(_finished(folder, console)):
         console.print(f"{method.name}: trained and evaluated already")
         return
     _train(config, evaluator, _samples(config, evaluator, data), folder, console)
@@ -250,6 +264,24 @@ def _samples(config: Config, evaluator: Evaluator, data: demos.Demos) -> learner
     return batch
 
 
+def _finished(folder: Path, console: Console) -> bool:
+    """Whether a method's results are there and whole; damaged ones are set aside, to be redone."""
+    paths = [folder / "eval.json", folder / "eval.npz"]
+    if not paths[0].exists():
+        return False
+    try:
+        records.check_counts(paths[0], records.load_eval(paths[1]))
+    except records.RecordError as error:
+        for path in paths:
+            if path.exists():
+                os.replace(path, path.with_name(f"{path.name}.damaged"))
+        console.print(
+            f"{error}; both are set aside as *.damaged, the evaluation is repeated", markup=False
+        )
+        return False
+    return True
+
+
 @contextmanager
 def _timed(folder: Path, what: str) -> Iterator[None]:
     """Adds the seconds spent inside to times.json, which also counts over interruptions."""
@@ -258,7 +290,7 @@ def _timed(folder: Path, what: str) -> Iterator[None]:
         yield
     finally:
         path = folder / "times.json"
-        times = records.load_json(path) if path.exists() else {}
+        times = _noted(path)
         times[what] = round(times.get(what, 0.0) + time.monotonic() - start, 2)
         write_json(path, times)
 
@@ -269,7 +301,8 @@ def _train(
     """Trains from the newest valid checkpoint, or from the start, to the last step."""
     model, store = evaluator.learner, folder / "checkpoints"
     state, done = None, 0
-    found = checkpoint.latest_valid(store)
+    belongs = workspace.fingerprint(config, evaluator.method.name)
+    found = checkpoint.latest_valid(store, fingerprint=belongs)
     if found:
         done, path = found
         state = checkpoint.load(path, model.abstract_state())
@@ -277,7 +310,8 @@ def _train(
             terminal.resumed(console, f"{evaluator.method.name}, step {done} of {config.steps}")
         _score_if_missing(config, evaluator, path, done, state)
     bank = _backgrounds(config) if evaluator.method.augment else None
-    stop = Stop()
+    dumped = debug.dumping(folder / debug.DUMPS, model)
+    stop = interrupts.Stop(_PROMISE)
     together = devices.Together(stop)
     with (
         MetricsLog(folder / "metrics.jsonl", resume_step=done) as log,
@@ -295,7 +329,11 @@ def _train(
             shown = step
 
         def on_checkpoint(step: int, state: learner.TrainState) -> None:
-            meta = {"method": evaluator.method.name, "task": config.task}
+            meta = {
+                "method": evaluator.method.name,
+                "task": config.task,
+                checkpoint.FINGERPRINT: belongs,
+            }
             path = checkpoint.save(store, step, state, meta, keep=config.keep)
             if not stop():
                 score = _score_if_missing(config, evaluator, path, step, state)
@@ -303,7 +341,11 @@ def _train(
                     log.write(step, {"in_domain_success": score})
             devices.wait()
 
-        with _timed(folder, "training_and_selection_s"):
+        def on_failure(failure: learner.Failure) -> None:
+            dump(failure)
+            devices.wait()
+
+        with _timed(folder, "training_and_selection_s"), dumped as dump:
             learner.run(
                 model,
                 data,
@@ -315,6 +357,7 @@ def _train(
                 checkpoint_every=config.checkpoint_every,
                 on_checkpoint=on_checkpoint,
                 should_stop=together,
+                on_failure=on_failure,
                 devices=jax.devices(),
             )
     if together.agreed:
@@ -348,7 +391,8 @@ def _backgrounds(config: Config) -> jax.Array:
 
 
 def _evaluate(config: Config, evaluator: Evaluator, folder: Path, console: Console) -> None:
-    policy = workspace.best_policy(folder, evaluator.learner)
+    belongs = workspace.fingerprint(config, evaluator.method.name)
+    policy = workspace.best_policy(folder, evaluator.learner, belongs)
     traces: dict[tuple[str, str], films.Trace] = {}
 
     def watch(variant: str, domain: str) -> films.Trace:
@@ -397,7 +441,7 @@ def _film(
     views: dict[str, np.ndarray] = {}
     for domain, trace in traces.items():
         views[f"input/{domain}"], views[f"frame/{domain}"] = camera(domain).first(trace)
-    np.savez_compressed(folder / "views.npz", **views)  # type: ignore[arg-type]
+    records.save_arrays(folder / "views.npz", views)
     for domain in [d for d in _FILMED if d in traces] or list(traces)[:1]:
         _film_domain(config, method, domain, camera(domain), traces[domain], folder)
 
@@ -440,26 +484,30 @@ def _sweeps(evaluators: dict[str, Evaluator], folders: dict[str, Path], console:
             continue
         evaluator = evaluators[name]
         with terminal.ProgressBar(console, job.episodes, f"sweep {name}", unit="episode") as bar:
-            found = job.run(
+            job.perform(
+                path,
                 evaluator,
                 workspace.best_policy(folder, evaluator.learner),
                 seed=options.seed,
                 aligned=workspace.quoted_variant(folder) == "aligned",
                 progress=bar.advance,
             )
-        job.save(path, found)
 
 
-def _gallery(folders: dict[str, Path], out: Path) -> None:
+def _gallery(folders: dict[str, Path], out: Path, console: Console) -> None:
     """What each method sees in each domain, on the same scenes."""
     inputs: dict[str, dict[str, np.ndarray]] = {}
     frames: dict[str, np.ndarray] = {}
     for name, folder in folders.items():
         path = folder / "views.npz"
-        if path.exists():
-            with np.load(path, allow_pickle=False) as views:
-                inputs[name] = _views(views, "input/")
-                frames |= _views(views, "frame/")
+        try:
+            views = records.load_arrays(path) if path.exists() else {}
+        except records.RecordError as error:
+            console.print(f"{error}; left out of the gallery", markup=False)
+            continue
+        if views:
+            inputs[name] = _views(views, "input/")
+            frames |= _views(views, "frame/")
     if inputs:
         figures.save(figures.gallery(inputs, frames=frames), out / "figures" / "gallery.png")
 

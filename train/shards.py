@@ -1,14 +1,14 @@
 """Parts of a sweep, made by several machines and joined into one file.
 
-A sweep falls into units that draw nothing from each other: batches of the grid, or strengths of a
-shift. Shard i of n runs every n-th of them and leaves RUN/shards/NAME-i-of-n.npz: the arrays of the
-whole sweep, of which its own units count, and a header with the conditions. `merge` joins the
-shards of one command, after a look at their headers, into the file of the undivided sweep.
+The episodes of a sweep draw nothing from each other. Shard i of n runs the i-th part of them, whole
+batches of the grid or whole strengths of a shift, and leaves RUN/shards/NAME-i-of-n.npz: the arrays
+of the whole sweep, of which its own part counts, and a header with the conditions. `merge` joins
+the shards of one command, after a look at their headers, into the file of the undivided sweep.
 """
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,7 @@ def save(path: Path, arrays: Mapping[str, Any], header: Mapping[str, Any]) -> Pa
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps(plain(header), sort_keys=True)
-    return records.write_arrays(path, {**arrays, HEADER: np.asarray(text)})
+    return records.save_arrays(path, {**arrays, HEADER: np.asarray(text)})
 
 
 def load(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
@@ -84,13 +84,18 @@ def check(path: Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> 
 
 
 def merge(
-    whole: Path, units: NDArray[np.int64], grid: Mapping[str, Any], header: Mapping[str, Any]
-) -> dict[str, NDArray[Any]]:
-    """The arrays of a whole sweep from those of its shards.
+    whole: Path,
+    shape: tuple[int, ...],
+    part: Callable[[tuple[int, int]], range],
+    grid: Mapping[str, Any],
+    header: Mapping[str, Any],
+) -> dict[str, Any]:
+    """The outcomes (`success`, `nan`) and the smallest `worlds` of a whole sweep, from its shards.
 
     Args:
       whole: the file of the undivided sweep; it names the shards.
-      units: number of the unit of every episode, in the shape of `success`.
+      shape: of the outcomes.
+      part: shard (i, n) -> its rows, in the flattened outcomes.
       grid: arrays of the record that every shard has to have just so.
       header: the conditions of the command that joins.
 
@@ -99,16 +104,19 @@ def merge(
       RecordError: a file that cannot be read.
     """
     count = _count(whole)
-    joined = {name: np.zeros(units.shape, bool) for name in ("success", "nan")}
+    joined = {name: np.zeros(int(np.prod(shape)), bool) for name in ("success", "nan")}
+    worlds = []
     for index in range(1, count + 1):
         path = path_of(whole, index, count)
         arrays, found = load(path)
         check(path, found, header)
-        _check_arrays(path, arrays, units.shape, grid)
-        mine = units % count == index - 1
+        _check_arrays(path, arrays, shape, grid)
+        rows = slice(part((index, count)).start, part((index, count)).stop)
         for name, into in joined.items():
-            into[mine] = arrays[name].astype(bool)[mine]
-    return {**{name: np.asarray(value) for name, value in grid.items()}, **joined}
+            into[rows] = arrays[name].astype(bool).ravel()[rows]
+        worlds.append(records.worlds_of(arrays))
+    outcomes = {name: values.reshape(shape) for name, values in joined.items()}
+    return {**outcomes, "worlds": min(worlds)}
 
 
 def _count(whole: Path) -> int:

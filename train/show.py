@@ -1,6 +1,7 @@
 """`python -m palm_jax show`: pictures of every world, as PNG.
 
 * `worlds.png`: the start of an episode, every task on every robot under every domain;
+* `robots.png`: every robot from several sides, and as a policy sees its hand;
 * `TASK.png`: the expert's episode on every robot, with the moments before each change of stage;
 * `axes.png`: each single shift from its least to its greatest strength, for one task;
 * `methods.png`: what every method sees of that task's scene, under some of the domains.
@@ -44,10 +45,18 @@ STRENGTHS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 _CALIBRATION = "calibration"  # axes that begin so change what a policy sees, not what a camera does
 _WINDOW = 84
 
+VIEWS = {
+    "from the front": ((1.3, 0.1, 1.45), (0.0, 0.0, 1.05)),
+    "from the left": ((0.15, 1.35, 1.25), (0.1, 0.0, 1.05)),
+    "from the right": ((0.85, -0.95, 1.5), (0.05, 0.0, 1.05)),
+    "the hand": ((0.75, 0.2, 1.1), (0.25, 0.0, 1.0)),
+}
+"""Columns of `robots.png` but the last: where the camera is and what it looks at, metres."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ShowConfig:
-    """Pictures of the worlds: worlds.png, axes.png, methods.png and one PNG for each task.
+    """Pictures of the worlds: worlds, robots, axes, methods and one more PNG for each task.
 
     Attributes:
       tasks: names; all of them if empty.
@@ -171,6 +180,20 @@ class Studio:
             taken += list(np.asarray(self._picture(_stack(rows), params)))
         return taken[: len(steps)], labels
 
+    def portraits(self, seed: int) -> list[figures.ImageArray]:
+        """The start of a scene in each of `VIEWS`, and what PALM sees of it."""
+        worlds, runner, method = self.runner.worlds, self.runner, methods.PALM
+        params = _stack([self.env.default_params()] * worlds)
+        state = runner.reset(jnp.broadcast_to(jax.random.key(seed), (worlds,)), params)
+        one = jax.tree.map(lambda leaf: leaf[0], state)
+        taken = []
+        for batch in _batches([looking_at(*view) for view in VIEWS.values()], worlds):
+            rows = [dataclasses.replace(one, camera_to_world=jnp.asarray(pose)) for pose in batch]
+            taken += list(np.asarray(self._picture(_stack(rows), params)))
+        spec = method.spec(self.env.task, _WINDOW)
+        seen = runner.observe(state, params, spec, frame=method.frame).image
+        return [*taken[: len(VIEWS)], np.asarray(seen[0])]
+
     def close(self) -> None:
         """Forgets all compiled programs, so that many worlds take no more memory than one."""
         jax.clear_caches()
@@ -199,6 +222,18 @@ def moments(stage: Sequence[int], stages: Sequence[Stage]) -> tuple[list[int], l
     return [*steps, end], [*labels, "end"]
 
 
+def looking_at(eye: Sequence[float], target: Sequence[float]) -> np.ndarray:
+    """Pose [4, 4] of a level camera at `eye` that has `target` in its middle."""
+    forward = np.subtract(target, eye)
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right = right / np.linalg.norm(right)
+    pose = np.eye(4, dtype=np.float32)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], -1)
+    pose[:3, 3] = eye
+    return pose
+
+
 def _batches(items: Sequence[T], size: int) -> Iterator[list[T]]:
     """Lists of `size`, the last one filled up with its last item."""
     for first in range(0, len(items), size):
@@ -220,6 +255,7 @@ def show(config: ShowConfig, console: terminal.Console) -> list[Path]:
     rows: list[str] = []
     starts: list[list[figures.ImageArray | None]] = []
     files: list[Path] = []
+    portraits: dict[str, list[figures.ImageArray]] = {}
     total = len(config.tasks) * len(config.robots) + 1
     with terminal.ProgressBar(console, total, "pictures", unit="world") as bar:
         for task in config.tasks:
@@ -231,6 +267,8 @@ def show(config: ShowConfig, console: terminal.Console) -> list[Path]:
                 starts.append([*studio.starts(config.seed, shifted)])
                 rows.append(f"{_words(task)}\n{robot}")
                 strips[robot] = studio.expert(config.seed)
+                if robot not in portraits:
+                    portraits[robot] = studio.portraits(config.seed)
                 if not files and robot == config.robots[0]:
                     files += [_axes(studio, config), _methods(studio, config)]
                     bar.advance()
@@ -240,7 +278,16 @@ def show(config: ShowConfig, console: terminal.Console) -> list[Path]:
     columns = [_words(domain) for domain in config.domains]
     title = "One scene of every task on every robot, under shifts at full strength"
     figure = figures.picture_grid(starts, rows, columns, title=title)
-    return [figures.save(figure, config.out / "worlds.png"), *files]
+    worlds = figures.save(figure, config.out / "worlds.png")
+    return [worlds, _robots(portraits, config.out), *files]
+
+
+def _robots(portraits: Mapping[str, Sequence[figures.ImageArray]], out: Path) -> Path:
+    """`robots.png` from each robot's pictures."""
+    figure = figures.picture_grid(
+        list(portraits.values()), list(portraits), [*VIEWS, "PALM sees"], title="The robots"
+    )
+    return figures.save(figure, out / "robots.png")
 
 
 def _episodes(

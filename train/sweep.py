@@ -9,6 +9,7 @@ cell.
 """
 
 import dataclasses
+import hashlib
 import re
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -23,8 +24,17 @@ from rich.console import Console
 
 from palm_jax.envs import registry, shifts
 from palm_jax.envs.base import EnvParams
-from palm_jax.envs.rollout import repeat_params, take_params
-from palm_jax.train import checkpoint, records, report, runs, shards, workspace
+from palm_jax.envs.rollout import Episodes, repeat_params
+from palm_jax.train import (
+    checkpoint,
+    interrupts,
+    locks,
+    records,
+    report,
+    runs,
+    shards,
+    workspace,
+)
 from palm_jax.train import console as terminal
 from palm_jax.train.evaluate import Evaluator, Runners
 from palm_jax.train.learner import PolicyState
@@ -46,8 +56,8 @@ class SweepConfig:
       seed: of the scenes.
       batch: worlds simulated at once (at most 128 on a CPU).
       redo: sweep again where a sweep is there already.
-      shard: "i/n", the i-th of n machines (from 1): it runs every n-th batch of the grid, or every
-        n-th strength, into RUN/shards.
+      shard: "i/n", the i-th of n machines (from 1): it runs its part of the grid's batches, or of
+        the strengths, into RUN/shards.
       merge: join the shards of this very command into one sweep; nothing is run.
     """
 
@@ -138,8 +148,9 @@ def sweep(
     episodes: int,
     seed: int,
     aligned: bool,
-    shard: tuple[int, int] = (1, 1),
+    only: range | None = None,
     progress: Callable[[int], None] | None = None,
+    partial_file: Path | None = None,
 ) -> records.Sweep:
     """Runs every cell of the grid.
 
@@ -150,27 +161,23 @@ def sweep(
       episodes: S, in every cell.
       seed: of the scenes.
       aligned: whether the hand's initial yaw turns with the camera.
-      shard: (i, n) runs every n-th unit, see `palm_jax.train.shards`; the others stay failures.
+      only: rows of the episodes (`Job.part`) to run, all by default; the others stay failures.
       progress: told how many episodes were finished.
+      partial_file: where finished episodes are kept meanwhile; those that are there are taken over.
     """
     params = evaluator.runner.env.default_params()
     if aligned:
         params = shifts.aligned_hand(params)
     cells = cell_params(params, angles, xs, ys, episodes)
-    total, batch = len(angles) * len(xs) * len(ys) * episodes, evaluator.runner.worlds
-    success, nan = np.zeros(total, bool), np.zeros(total, bool)
-    for first in range(0, total, batch):
-        if first // batch % shard[1] != shard[0] - 1:
-            continue
-        rows = np.arange(first, min(first + batch, total))
-        part = take_params(cells, rows)
-        scenes = jax.random.fold_in(jax.random.key(seed), first)
-        result = evaluator.episodes(policy, scenes, part, len(rows))
-        success[rows], nan[rows] = result.success, result.nan
-        if progress:
-            progress(len(rows))
     shape = (len(angles), len(xs), len(ys), episodes)
-    return records.Sweep(angles, xs, ys, success.reshape(shape), nan.reshape(shape))
+    question = _digest("grid", angles, xs, ys, episodes, seed, aligned, policy)
+    found = _Found(partial_file, question, int(np.prod(shape)), progress, only)
+    scenes = jax.random.fold_in(jax.random.key(seed), 0)
+    for rows, part in evaluator.batches(policy, scenes, cells, found.end, first=found.done):
+        found.add(rows, part)
+    return records.Sweep(
+        angles, xs, ys, found.success.reshape(shape), found.nan.reshape(shape), _worlds(evaluator)
+    )
 
 
 def sweep_strength(
@@ -182,8 +189,9 @@ def sweep_strength(
     episodes: int,
     seed: int,
     aligned: bool,
-    shard: tuple[int, int] = (1, 1),
+    only: range | None = None,
     progress: Callable[[int], None] | None = None,
+    partial_file: Path | None = None,
 ) -> records.StrengthSweep:
     """Runs the same scenes at every strength of a shift.
 
@@ -195,23 +203,98 @@ def sweep_strength(
       episodes: S, the scenes.
       seed: of the scenes.
       aligned: whether the hand's initial yaw turns with the camera.
-      shard: (i, n) runs every n-th unit, see `palm_jax.train.shards`; the others stay failures.
+      only: rows of the episodes (`Job.part`) to run, all by default; the others stay failures.
       progress: told how many episodes were finished.
-
+      partial_file: as for `sweep`.
     """
     params = evaluator.runner.env.default_params()
     if aligned:
         params = shifts.aligned_hand(params)
-    success, nan = np.zeros((2, len(strengths), episodes), bool)
+    shape = (len(strengths), episodes)
+    question = _digest(shift, strengths, episodes, seed, aligned, policy)
+    found = _Found(partial_file, question, int(np.prod(shape)), progress, only)
+    scenes = jax.random.key(seed)
     for row, strength in enumerate(strengths):
-        if row % shard[1] != shard[0] - 1:
+        begin = row * episodes
+        first, last = max(found.done - begin, 0), min(found.end - begin, episodes)
+        if first >= last:
             continue
         there = repeat_params(shifts.shifted(params, shift, strength=float(strength)), episodes)
-        result = evaluator.episodes(policy, jax.random.key(seed), there, episodes)
-        success[row], nan[row] = result.success, result.nan
-        if progress:
-            progress(episodes)
-    return records.StrengthSweep(shift, strengths, success, nan)
+        for rows, part in evaluator.batches(policy, scenes, there, last, first=first):
+            found.add(begin + rows, part)
+    success, nan = found.success.reshape(shape), found.nan.reshape(shape)
+    return records.StrengthSweep(shift, strengths, success, nan, _worlds(evaluator))
+
+
+def _worlds(evaluator: Evaluator) -> int:
+    return evaluator.runner.worlds
+
+
+def _digest(*values: Any) -> str:
+    """Of a question: numbers, texts and trees of arrays."""
+    digest = hashlib.sha256()
+    for value in values:
+        for leaf in jax.tree.leaves(value):
+            array = np.asarray(leaf)
+            digest.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()
+
+
+class _Found:
+    """Outcomes in their order, kept in a file from batch to batch: a sweep takes hours."""
+
+    def __init__(
+        self,
+        path: Path | None,
+        question: str,
+        total: int,
+        progress: Callable[[int], None] | None,
+        only: range | None = None,
+    ) -> None:
+        """What the file holds of the same `question` is taken over; `progress` is told of it.
+
+        `only`: rows that are asked for, all by default; the others stay failures.
+        """
+        self.total, self.done, self.end = total, 0, total
+        if only is not None:
+            self.done, self.end = only.start, only.stop
+        self.success, self.nan = np.zeros((2, total), bool)
+        self._path, self._question, self._progress = path, question, progress
+        if path is not None and path.exists():
+            self._take_over(path)
+
+    def _take_over(self, path: Path) -> None:
+        try:
+            kept = records.load_arrays(path)
+            if str(kept["question"]) != self._question:
+                return
+            success, nan = kept["success"].astype(bool), kept["nan"].astype(bool)
+        except (records.RecordError, KeyError):
+            return  # damaged: these episodes are run again
+        if success.shape != nan.shape or success.ndim != 1 or len(success) > self.total:
+            return
+        if not self.done <= len(success) <= self.end:
+            return
+        self._tell(len(success) - self.done)
+        self.done = len(success)
+        self.success[: self.done], self.nan[: self.done] = success, nan
+
+    def add(self, rows: np.ndarray, part: Episodes) -> None:
+        """The outcomes of the next rows."""
+        self.success[rows], self.nan[rows] = part.success, part.nan
+        self.done = int(rows[-1]) + 1
+        if self._path is not None:
+            arrays = {
+                "question": np.array(self._question),
+                "success": self.success[: self.done],
+                "nan": self.nan[: self.done],
+            }
+            records.save_arrays(self._path, arrays)
+        self._tell(len(rows))
+
+    def _tell(self, count: int) -> None:
+        if self._progress and count:
+            self._progress(count)
 
 
 class Job(NamedTuple):
@@ -223,11 +306,35 @@ class Job(NamedTuple):
     save: Callable[[Path, Any], Path]
     record: type[Any]  # what is saved
     grid: dict[str, Any]  # fields of the record that the command says
-    units: np.ndarray  # number of the unit of every episode, in the shape of `success`
+    shape: tuple[int, ...]  # of the outcomes
+    unit: int  # episodes that are not divided among shards
 
-    def part(self, shard: tuple[int, int]) -> int:
-        """Episodes of a shard."""
-        return int((self.units % shard[1] == shard[0] - 1).sum())
+    def part(self, shard: tuple[int, int]) -> range:
+        """Rows of a shard (i, n): whole units, as many for each as can be."""
+        units = -(-self.episodes // self.unit)
+        first, last = ((i * units) // shard[1] * self.unit for i in (shard[0] - 1, shard[0]))
+        return range(min(first, self.episodes), min(last, self.episodes))
+
+    def perform(
+        self,
+        path: Path,
+        evaluator: Evaluator,
+        policy: PolicyState,
+        *,
+        save: Callable[[Path, Any], Path] | None = None,
+        **options: Any,
+    ) -> Any:
+        """Runs it into a file, by way of a partial one beside that.
+
+        Args:
+          save: writes the file, if not as usual.
+          options: see `sweep`.
+        """
+        kept = path.with_name(f".{path.name}.partial")
+        found = self.run(evaluator, policy, partial_file=kept, **options)
+        (save or self.save)(path, found)
+        kept.unlink(missing_ok=True)
+        return found
 
 
 def job(config: SweepConfig) -> Job:
@@ -247,18 +354,21 @@ def job(config: SweepConfig) -> Job:
         run = partial(sweep_strength, shift=config.shift, strengths=strengths, episodes=count)
         # Worlds beyond the scenes of one strength would run for nothing.
         worlds = min(config.batch, count)
-        units = np.repeat(np.arange(len(strengths))[:, None], count, axis=1)
+        shape: tuple[int, ...] = (len(strengths), count)
         line = {"shift": config.shift, "strengths": strengths}
         return Job(
-            worlds, units.size, run, records.save_strengths, records.StrengthSweep, line, units
-        )
+            worlds, int(np.prod(shape)), run, records.save_strengths, records.StrengthSweep, line,
+            shape, count,
+        )  # fmt: skip
     angles, (xs, ys) = angles_of(config.camera), cells_of(config.workspace)
     count = config.episodes or 1
     grid = partial(sweep, angles=angles, xs=xs, ys=ys, episodes=count)
     shape = (len(angles), len(xs), len(ys), count)
-    units = (np.arange(np.prod(shape)) // config.batch).reshape(shape)
     axes = {"angles": angles, "xs": xs, "ys": ys}
-    return Job(config.batch, units.size, grid, records.save_sweep, records.Sweep, axes, units)
+    return Job(
+        config.batch, int(np.prod(shape)), grid, records.save_sweep, records.Sweep, axes, shape,
+        config.batch,
+    )  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -266,10 +376,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     config = tyro.cli(SweepConfig, args=argv, prog="python -m palm_jax sweep")
     console = terminal.make_console()
     try:
-        _run(config, console)
-    except (ValueError, OSError) as error:
+        with interrupts.raising():
+            _run(config, console)
+    except (ValueError, OSError, MemoryError) as error:
         console.print(f"error: {error}", markup=False)
         return 2
+    except KeyboardInterrupt:
+        console.print("Stopped; the same command goes on with the batch that was running.")
+        return 130
     if config.shard:
         return 0  # the report is for the one who joins the shards
     return report.main([str(config.run)])
@@ -304,29 +418,55 @@ def _run(config: SweepConfig, console: Console) -> None:
             continue
         world = stored.task, robot
         if world not in runners:
-            runners[world] = Runners.of(stored.task, robot, stored.second_robot, asked.worlds)
-        evaluator, policy = workspace.load_policy(folder, runners[world])
-        label = f"sweep {evaluator.method.name}"
-        with terminal.ProgressBar(console, asked.part(shard), label, unit="episode") as bar:
-            found = asked.run(
-                evaluator,
-                policy,
-                seed=config.seed,
-                aligned=workspace.quoted_variant(folder) == "aligned",
-                shard=shard,
-                progress=bar.advance,
+            runners[world] = Runners.of(
+                stored.task,
+                robot,
+                stored.second_robot,
+                asked.worlds,
+                tell=lambda text: console.print(text, style="bold", markup=False),
             )
-        if config.shard:
-            shards.save(into, vars(found), _header(config, folder))
-            console.print(f"Shard {config.shard}: {into}", markup=False)
-        else:
-            asked.save(path, found)
+        try:
+            with locks.claim(folder, name=f".{into.stem}.claim"):
+                _sweep_one(folder, into, asked, config, runners[world], console)
+        except locks.Busy as error:
+            console.print(f"{into} is left to another process: {error}", markup=False)
+
+
+def _sweep_one(
+    folder: Path,
+    path: Path,
+    asked: Job,
+    config: SweepConfig,
+    runners: Runners,
+    console: Console,
+) -> None:
+    """One policy's file, or a shard of it."""
+    evaluator, policy = workspace.load_policy(folder, runners)
+    label, options = f"sweep {evaluator.method.name}", dict[str, Any]()
+    only = range(asked.episodes)
+    if config.shard:
+        only, header = asked.part(shards.parse(config.shard)), _header(config, folder)
+        path.parent.mkdir(exist_ok=True)
+        options["save"] = lambda into, found: shards.save(into, vars(found), header)
+    with terminal.ProgressBar(console, len(only), label, unit="episode") as bar:
+        asked.perform(
+            path,
+            evaluator,
+            policy,
+            seed=config.seed,
+            aligned=workspace.quoted_variant(folder) == "aligned",
+            only=only,
+            progress=bar.advance,
+            **options,
+        )
+    if config.shard:
+        console.print(f"Shard {config.shard}: {path}", markup=False)
 
 
 def _header(config: SweepConfig, folder: Path) -> dict[str, Any]:
     """The conditions of a run's sweep in which its shards must agree."""
-    best = checkpoint.best(folder / "checkpoints")
     stored = workspace.stored_config(folder)
+    best = checkpoint.best(folder / "checkpoints")
     return {
         "task": stored.task,
         "method": stored.method[0],
@@ -335,11 +475,11 @@ def _header(config: SweepConfig, folder: Path) -> dict[str, Any]:
         "seed": config.seed,
         "batch": config.batch,
         "aligned": workspace.quoted_variant(folder) == "aligned",
-        "policy": checkpoint.fingerprint(best[0][1]) if best else None,
+        "policy": checkpoint.content_hash(best[0][1]) if best else None,
         "versions": workspace.versions(),
     }
 
 
 def _merged(config: SweepConfig, asked: Job, folder: Path, path: Path) -> Any:
-    arrays = shards.merge(path, asked.units, asked.grid, _header(config, folder))
-    return asked.record(**{**asked.grid, "success": arrays["success"], "nan": arrays["nan"]})
+    arrays = shards.merge(path, asked.shape, asked.part, asked.grid, _header(config, folder))
+    return asked.record(**asked.grid, **arrays)

@@ -15,6 +15,8 @@ one lie in an .npz file beside it, laid out like eval.npz with TASK/METHOD/SEED/
 
 import dataclasses
 import datetime
+import hashlib
+import json
 import os
 import statistics
 import subprocess
@@ -31,15 +33,14 @@ from palm_jax.envs.registry import TASKS
 from palm_jax.envs.shifts import DOMAINS
 from palm_jax.train import config as configuration
 from palm_jax.train import console as terminal
-from palm_jax.train import methods, records, table_page, workspace
+from palm_jax.train import interrupts, locks, methods, records, table_page, workspace
 from palm_jax.train.config import Config, ConfigError
 from palm_jax.train.metrics import plain, write_json
 
 _FIRST = ("palm", "bc")
 """Methods whose cells come first: the claim stands and falls with them."""
 
-_OTHER = ("palm-crop", "palm-overlay", "palm-aug", "palm-prop", "mirrorduo", "roviaug", "arro")
-_TASKS = ("lift_lid", "lift_spam", "insert_peg", "rearrange_veggies")
+_POLL_S = 0.1  # how soon the end of a cell, and a signal, are noticed
 _KEPT = (
     "robot", "other_robot", "demos", "demo_seed", "demo_noise", "image_size", "random_crop",
     "width", "norm", "steps", "batch_size", "learning_rate", "schedule", "warmup_steps",
@@ -63,17 +64,19 @@ class TableConfig:
       shard: "i/n", the i-th of n machines (from 1): it takes every n-th cell. Each has its own
         folder and file; `--merge` joins the files.
       merge: files of other shards whose results are taken over; nothing is run.
+      take_over: run cells that a process on another machine has claimed, too: only if it is gone.
       page: a Markdown file that the results are written into; nothing is run.
     """
 
     preset: str = "cpu"
-    tasks: tuple[str, ...] = _TASKS
-    methods: tuple[str, ...] = (*_FIRST, *_OTHER)
+    tasks: tuple[str, ...] = table_page.PAPER_TASKS
+    methods: tuple[str, ...] = table_page.PAPER_METHODS
     seeds: tuple[int, ...] = (0,)
     out: Path | None = None
     json: Path | None = None
     shard: str = "1/1"
     merge: tuple[Path, ...] = ()
+    take_over: bool = False
     page: Path | None = None
 
     @property
@@ -178,6 +181,10 @@ def header(config: TableConfig) -> dict[str, Any]:
     }
 
 
+_START_ANEW = (
+    "move it and the .npz or .json file beside it away and call again; finished cells are taken "
+    "from their folders, and other shards' merged anew"
+)
 _MUST_AGREE = ("preset", "recipe", "domains", "versions")
 
 
@@ -189,7 +196,10 @@ def read(path: Path, fresh: dict[str, Any]) -> dict[str, Any]:
     """
     if not path.exists():
         return {"header": fresh, "results": {}, "failed": {}}
-    table: dict[str, Any] = records.load_json(path)
+    try:
+        table: dict[str, Any] = records.load_json(path)
+    except records.RecordError as error:
+        raise records.RecordError(f"{error}: {_START_ANEW}") from error
     old = table.get("header", {})
     for name in _MUST_AGREE:
         if old.get(name) != fresh[name]:
@@ -197,7 +207,19 @@ def read(path: Path, fresh: dict[str, Any]) -> dict[str, Any]:
                 f"{path} was begun with {_difference(name, old.get(name), fresh[name])}: results "
                 "of two kinds are not mixed. Choose another --json and --out, or go back"
             )
+    if table.get("sha256", _digest(table)) != _digest(table):
+        raise records.RecordError(f"{path}: the content is not what was written: {_START_ANEW}")
     return table
+
+
+def _store(path: Path, table: dict[str, Any]) -> None:
+    write_json(path, {**table, "sha256": _digest(table)})
+
+
+def _digest(table: Mapping[str, Any]) -> str:
+    """Of a table's content, so that a digit that was changed is noticed."""
+    content = {name: value for name, value in table.items() if name != "sha256"}
+    return hashlib.sha256(json.dumps(plain(content), sort_keys=True).encode()).hexdigest()
 
 
 def _difference(name: str, old: Any, new: Any) -> str:
@@ -236,30 +258,53 @@ def run(config: TableConfig, console: Console) -> Path:
     asked, fresh = cells(config), header(config)
     table = read(config.file, fresh)
     if config.merge:
-        _merge_all(config, table, fresh)
+        with locks.locked(config.file):
+            _merge_all(config, read(config.file, fresh), fresh)
         return config.file
     missing = [cell for cell in asked if _get(table, "results", cell) is None]
-    console.print(
-        f"{len(asked)} cells, {len(asked) - len(missing)} done, into {config.file}", markup=False
-    )
+    done = len(asked) - len(missing)
+    console.print(f"{len(asked)} cells, {done} done, into {config.file}", markup=False)
     took: list[float] = []
     for number, cell in enumerate(missing):
-        _announce(console, cell, len(missing) - number, took)
-        start = time.monotonic()
-        log = config.folder / f"{cell.name}.log"
-        code = _train(cell_config(config, cell), log)
-        table = read(config.file, fresh)  # another shard may write beside us
-        if code == 0 and (config.folder / cell.name / "eval.json").exists():
+        try:
+            with locks.claim(config.folder / cell.name, take_over=config.take_over):
+                if _get(read(config.file, fresh), "results", cell) is None:
+                    _announce(console, cell, len(missing) - number, took)
+                    _run_cell(config, cell, fresh, console, took)
+        except locks.Busy as error:
+            hint = ", or call with --take-over" if error.elsewhere else ""
+            console.print(f"{cell.name} is left to another process: {error}{hint}", markup=False)
+    return config.file
+
+
+def _run_cell(
+    config: TableConfig, cell: Cell, fresh: dict[str, Any], console: Console, took: list[float]
+) -> None:
+    """Trains a cell that is claimed, and enters what came of it into the file."""
+    start = time.monotonic()
+    log = config.folder / f"{cell.name}.log"
+    code = _train(cell_config(config, cell), log)
+    with locks.locked(config.file):  # another process may write beside us
+        table = read(config.file, fresh)
+        if code == 0 and _whole(config.folder / cell.name, console):
             _take(table, config, cell)
             took.append(time.monotonic() - start)
         else:
             _put(table, "failed", cell, str(log))
-            console.print(
-                f"{cell.name} failed (exit code {code}): see {log}", style="bold red", markup=False
-            )
+            words = f"{cell.name} failed (exit code {code}): see {log}"
+            console.print(words, style="bold red", markup=False)
         _note_origin(table["header"], fresh)
-        write_json(config.file, table)
-    return config.file
+        _store(config.file, table)
+
+
+def _whole(folder: Path, console: Console) -> bool:
+    """Whether a cell has left results that can be read."""
+    try:
+        records.check_counts(folder / "eval.json", records.load_eval(folder / "eval.npz"))
+    except records.RecordError as error:
+        console.print(f"{error}", markup=False)
+        return False
+    return True
 
 
 def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
@@ -281,13 +326,17 @@ def _note_speed(table: dict[str, Any]) -> None:
     training = [t["training_and_selection_s"] - t.get("selection_s", 0.0) for t in times]
     if training:
         header["samples_per_second"] = round(samples / statistics.median(training), 1)
-        header["evaluation_seconds"] = statistics.median(t["evaluation_s"] for t in times)
+        seconds = statistics.median(t["evaluation_s"] for t in times)
+        header["evaluation_seconds"] = round(seconds, 1)
 
 
 def _keep_episodes(table: Path, fresh: Mapping[Cell, Mapping[str, records.DomainRecord]]) -> None:
     """Adds the episodes of cells to those beside the table."""
     path = table_page.episodes_file(table)
-    kept = records.load_eval(path) if path.exists() else {}
+    try:
+        kept = records.load_eval(path) if path.exists() else {}
+    except records.RecordError as error:
+        raise records.RecordError(f"{error}: {_START_ANEW}") from error
     for cell, by_domain in fresh.items():
         for domain, record in by_domain.items():
             kept[f"{cell.task}/{cell.method}/{cell.seed}/{domain}"] = record
@@ -314,16 +363,33 @@ def _train(config: Config, log: Path) -> int:
     with log.open("a") as output:
         output.write(f"$ {' '.join(words)}\n")
         output.flush()
-        done = subprocess.run(
+        # In a group of its own: a terminal's Ctrl-C reaches it through us, and once.
+        process = subprocess.Popen(
             [sys.executable, *words[1:]],
             stdout=output,
             stderr=subprocess.STDOUT,
             env=_environment(config.data.parents[1]),
             close_fds=False,
+            process_group=0,
         )
-    if done.returncode == 130:
+        return _outcome(process)
+
+
+def _outcome(process: subprocess.Popen[bytes]) -> int:
+    """Waits for a cell. A signal is passed on: the cell saves, and goes on another time."""
+    stop = interrupts.Stop("Stopping after the running cell has saved; once more ends at once.")
+    try:
+        with stop.listening():
+            while process.poll() is None and not stop():
+                time.sleep(_POLL_S)
+            if stop():
+                process.terminate()
+            code = process.wait()
+    finally:
+        process.kill()  # nothing, if it has ended
+    if stop() or code == 130:
         raise KeyboardInterrupt
-    return done.returncode
+    return code
 
 
 def _environment(folder: Path) -> dict[str, str]:
@@ -370,7 +436,7 @@ def _merge_all(config: TableConfig, table: dict[str, Any], fresh: dict[str, Any]
             episodes.setdefault(Cell(task, method, int(seed)), {})[domain] = record
         _keep_episodes(config.file, {cell: episodes[cell] for cell in taken if cell in episodes})
     _note_speed(table)
-    write_json(config.file, table)
+    _store(config.file, table)
 
 
 def _cells_of(table: dict[str, Any], part: str) -> Iterator[Cell]:
@@ -389,14 +455,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             written = table_page.write(config.file, config.page)
             console.print(f"Written: {', '.join(map(str, written))}", highlight=False, markup=False)
             return 0
-        path = run(config, console)
-    except (ConfigError, records.RecordError) as error:
+        with interrupts.raising():
+            path = run(config, console)
+    except (ConfigError, records.RecordError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         console.print("Stopped; the same command goes on with what is missing.")
         return 130
-    failed = list(_cells_of(records.load_json(path), "failed"))
+    failed = list(_cells_of(records.load_json(path), "failed")) if path.exists() else []
     words = f"; {len(failed)} cells failed" if failed else ""
     console.print(f"Results: {path}{words}", markup=False)
     return 1 if failed else 0

@@ -14,6 +14,13 @@ Episodes = dict[str, dict[str, dict[str, DomainRecord]]]  # task -> method -> do
 
 _COLUMNS = tuple(paper.DOMAINS)
 
+PAPER_TASKS = ("lift_lid", "lift_spam", "insert_peg", "rearrange_veggies")
+PAPER_METHODS = (
+    "palm", "bc", "palm-crop", "palm-overlay", "palm-aug", "palm-prop", "mirrorduo", "roviaug",
+    "arro",
+)  # fmt: skip
+"""Rows and columns of the paper's table."""
+
 
 def markers(preset: str) -> tuple[str, str]:
     """The lines of the page that the text of this preset stands between."""
@@ -118,6 +125,21 @@ def _policy(
     return [name, seed, *cells, _number(sum(losses) / len(losses)), command]
 
 
+def _missing(table: Mapping[str, Any]) -> list[str]:
+    """Methods of the paper's table, each with the tasks on which it has no policy yet."""
+    lines = []
+    for method in PAPER_METHODS:
+        tasks = [
+            paper.task_label(task)
+            for task in PAPER_TASKS
+            if not table["results"].get(task, {}).get(method)
+        ]
+        if tasks:
+            where = "every task" if len(tasks) == len(PAPER_TASKS) else ", ".join(tasks)
+            lines.append(f"{paper.method_label(method)} ({where})")
+    return lines
+
+
 def _failed(table: Mapping[str, Any]) -> Iterator[str]:
     for task, row in table.get("failed", {}).items():
         for method, seeds in row.items():
@@ -135,7 +157,9 @@ def text(table: Mapping[str, Any], drawn: Mapping[str, Sequence[str]]) -> str:
     rows, header = rows_of(table), table["header"]
     parts = [f"## The main table, preset `{header['preset']}`", _cell(_conditions(header))]
     parts += ["### Means over the tasks", _means(rows), "### The claims", _claims(rows)]
-    failed = list(_failed(table))
+    missing, failed = _missing(table), list(_failed(table))
+    if missing:
+        parts.insert(1, f"Not complete: {'; '.join(missing)} not run yet.")
     if failed:
         parts.append(f"Failed, and in no number above: {_cell('; '.join(failed))}.")
     for task, row in table["results"].items():

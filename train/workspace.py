@@ -2,6 +2,7 @@
 
 import dataclasses
 import datetime
+import hashlib
 import json
 import os
 import platform
@@ -72,7 +73,13 @@ def begin(config: Config, folder: Path, method: str) -> None:
     """
     path, fresh = folder / "config.json", stored(config, method)
     if path.exists():
-        old = records.load_json(path)
+        try:
+            old = records.load_json(path)
+        except records.RecordError as error:
+            raise ConfigError(
+                f"{error}: move it away and call again with the options that the run began with; "
+                "checkpoints of other options are not used"
+            ) from error
         if not config.resume:
             raise ConfigError(
                 f"{folder} holds a run already: add --resume to go on, or choose another --out"
@@ -85,6 +92,14 @@ def begin(config: Config, folder: Path, method: str) -> None:
                     f"{now.get(name)!r}: resume with the old value, or choose another --out"
                 )
     write_json(path, json.loads(json.dumps(fresh, default=str)))
+
+
+def fingerprint(config: Config, method: str) -> str:
+    """Of all options that a run must keep: what its checkpoints are told by from others'."""
+    values = stored(config, method)
+    kept = {name: value for name, value in values.items() if name not in _FREE}
+    text = json.dumps({**kept, "method": method}, default=str, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def environment(config: Config, *, wall_s: float) -> dict[str, Any]:
@@ -170,19 +185,31 @@ def load_policy(folder: Path, runners: Runners) -> tuple[Evaluator, PolicyState]
     """
     config = stored_config(folder)
     evaluator = make_evaluator(config, methods.find(config.method[0]), runners)
-    return evaluator, best_policy(folder, evaluator.learner)
+    belongs = fingerprint(config, config.method[0])
+    return evaluator, best_policy(folder, evaluator.learner, belongs)
 
 
-def best_policy(folder: Path, learner: Learner) -> PolicyState:
-    """Parameters of the best checkpoint in `folder/checkpoints`.
+def best_policy(folder: Path, learner: Learner, belongs: str | None = None) -> PolicyState:
+    """Parameters of the best checkpoint in `folder/checkpoints`; of those of a `fingerprint`.
 
     Raises:
       ConfigError: there is none.
     """
-    best = checkpoint.best(folder / "checkpoints")
+    _, path = best_checkpoint(folder, belongs)
+    return learner.policy_state(checkpoint.load(path, learner.abstract_state()))
+
+
+def best_checkpoint(folder: Path, belongs: str | None = None) -> tuple[int, Path]:
+    """(step, path) of the checkpoint in `folder/checkpoints` with the best in-domain success; of
+    those of a `fingerprint`.
+
+    Raises:
+      ConfigError: there is none.
+    """
+    best = checkpoint.best(folder / "checkpoints", fingerprint=belongs)
     if not best:
         raise ConfigError(f"{folder}/checkpoints holds no whole, scored checkpoint: train first")
-    return learner.policy_state(checkpoint.load(best[0][1], learner.abstract_state()))
+    return best[0]
 
 
 def quoted_variant(folder: Path) -> str:

@@ -49,9 +49,11 @@ from palm_jax.align.augment import (
 from palm_jax.align.camera import Camera, project, unproject, unproject_to_height
 from palm_jax.align.crop import resize, tcp_crop
 from palm_jax.align.isolate import isolate
+from palm_jax.align.lens import distort_points, undistort, undistort_points
 from palm_jax.align.overlay import tcp_overlay
 from palm_jax.align.pipeline import Aligned, AlignSpec, align, align_window, window_origin
 from palm_jax.align.proprio import matrix_from_6d, proprio, rotation_6d
+from palm_jax.align.reframe import align_like, reframe
 from palm_jax.align.textures import procedural_bank
 
 __all__ = [
@@ -66,9 +68,11 @@ __all__ = [
     "ShapeError",
     "achieved_deltas",
     "align",
+    "align_like",
     "align_window",
     "apply_delta",
     "center_crop",
+    "distort_points",
     "encode_delta",
     "gripper_labels",
     "isolate",
@@ -83,12 +87,15 @@ __all__ = [
     "random_overlay",
     "random_perspective",
     "random_turn",
+    "reframe",
     "resize",
     "rotation_6d",
     "subpixel_crop",
     "tcp_crop",
     "tcp_overlay",
     "turn_view",
+    "undistort",
+    "undistort_points",
     "unproject",
     "unproject_to_height",
     "window_origin",

@@ -14,7 +14,7 @@ from palm_jax.envs import ROBOTS, control, make
 from palm_jax.envs.base import Env
 
 TABLE = 0.752
-TCP_DISTANCE = {"panda": 0.1034, "ur5": 0.145}
+TCP_DISTANCE = {"panda": 0.1034, "ur5": 0.145, "xarm7": 0.163}
 """From the flange to the TCP, metres."""
 
 
@@ -90,6 +90,49 @@ def test_ur5_matches_an_independent_urdf(env: Env, row: dict) -> None:
     np.testing.assert_allclose(np.linalg.inv(base) @ site_pose(data, "tcp"), tcp, atol=2e-6)
     chain = control.forward_kinematics(env.chain, jnp.array(row["q"], jnp.float32)).tcp
     np.testing.assert_allclose(chain, base @ tcp, atol=5e-6)
+
+
+XARM7_TABLE = (
+    (0.0, 0.0, 0.267),
+    (0.0, -90.0, 0.0),
+    (0.0, 90.0, 0.293),
+    (0.0525, 90.0, 0.0),
+    (0.0775, 90.0, 0.3425),
+    (0.0, 90.0, 0.0),
+    (0.076, -90.0, 0.097),
+)
+"""The maker's modified Denavit-Hartenberg table: a (m), alpha (degrees), d (m) of each joint."""
+
+
+def from_table(rows: tuple[tuple[float, float, float], ...], q: np.ndarray) -> np.ndarray:
+    """The last frame [4, 4] in the base's, after Craig: Rx(alpha) Tx(a) Rz(q) Tz(d) a joint."""
+    frame = np.eye(4)
+    for (a, alpha, d), angle in zip(rows, q, strict=True):
+        ca, sa = np.cos(np.radians(alpha)), np.sin(np.radians(alpha))
+        c, s = np.cos(angle), np.sin(angle)
+        frame = frame @ np.array(
+            [
+                [c, -s, 0, a],
+                [s * ca, c * ca, -sa, -d * sa],
+                [s * sa, c * sa, ca, d * ca],
+                [0, 0, 0, 1],
+            ]
+        )
+    return frame
+
+
+@pytest.mark.parametrize("env", ["xarm7"], indirect=True)
+def test_xarm7_matches_the_makers_table(env: Env) -> None:
+    """The flange is the last joint's frame; the hand sits on it unturned, the TCP 0.163 m ahead."""
+    poses = np.random.default_rng(3).uniform(-np.pi, np.pi, (64, 7))
+    forward = jax.jit(jax.vmap(lambda q: control.forward_kinematics(env.chain, q).tcp))
+    for q, chain in zip(poses, forward(poses.astype(np.float32)), strict=True):
+        data = with_arm(env, q)
+        base, flange = body_pose(data, "robot_base"), from_table(XARM7_TABLE, q)
+        tcp = flange @ pose(np.eye(3), np.array([0, 0, 0.163]))
+        ours = np.linalg.inv(base) @ site_pose(data, "flange")
+        np.testing.assert_allclose(ours, flange, atol=1e-9)
+        np.testing.assert_allclose(chain, base @ tcp, atol=5e-6)
 
 
 def test_kinematics_and_jacobian_are_mujocos(env: Env, joints: np.ndarray) -> None:
@@ -183,12 +226,12 @@ def test_reach_finds_every_pose_of_the_region(
 
 
 def test_the_arm_stays_above_the_table(env: Env, reached: np.ndarray) -> None:
-    """The elbow is up: every joint is 0.2 m above the table, if it ever is, wherever the hand."""
+    """The elbow is up: every joint is 0.17 m above the table, if it ever is, wherever the hand."""
     links = [int(env.mj_model.joint(name).bodyid[0]) for name in env.robot.arm_joints]
     home = with_arm(env, np.array(env.robot.home)).xpos[links, 2]
     for q in reached:
         heights = with_arm(env, q).xpos[links, 2]
-        assert (heights > np.minimum(home, TABLE + 0.2) - 1e-6).all(), heights - TABLE
+        assert (heights > np.minimum(home, TABLE + 0.17) - 1e-6).all(), heights - TABLE
 
 
 def deltas(count: int) -> np.ndarray:
@@ -286,7 +329,8 @@ def test_joints_keep_their_speed_limits(env: Env) -> None:
     state = runner.reset(worlds.keys(1), params)
     far = jnp.tile(jnp.array([1.0, 0, 0, 0, 1.0, 0, 0.3, 0.3, 0.1, 1.0]), (worlds.WORLDS, 1))
     after = runner.step(state, far, params)
-    limits = {"panda": [2.175] * 4 + [2.61] * 3, "ur5": [np.pi] * 6}[env.robot.name]  # rad/s
+    makers = {"panda": [2.175] * 4 + [2.61] * 3, "ur5": [np.pi] * 6, "xarm7": [np.pi] * 7}  # rad/s
+    limits = makers[env.robot.name]
     joints = slice(len(limits))
     move = np.abs(np.asarray(after.data.ctrl)[:, joints] - np.asarray(state.data.qpos)[:, joints])
     allowed = np.array(limits) * 0.05

@@ -332,8 +332,8 @@ def test_retention_and_choice(tmp_path: Path) -> None:
         checkpoint.save(tmp_path, step, tree, {"score": score})
     ranked = [step for step, _ in checkpoint.best(tmp_path, count=10)]
     assert ranked == [40, 20, 50, 10]  # the newer first among equals; no score, no rank
-    assert checkpoint.prune(tmp_path, keep=2) == [10, 30, 50]
-    assert [step for step, _ in checkpoint.steps(tmp_path)] == [20, 40, 60]
+    assert checkpoint.prune(tmp_path, keep=2) == [10, 30]
+    assert [step for step, _ in checkpoint.steps(tmp_path)] == [20, 40, 50, 60]
 
     checkpoint.update_meta(tmp_path / "60", score=np.float32(0.95), note="late")
     assert checkpoint.read_meta(tmp_path / "60")["note"] == "late"
@@ -346,10 +346,10 @@ def test_retention_and_choice(tmp_path: Path) -> None:
     assert checkpoint.best(tmp_path) == [(70, tmp_path / "70")]
 
 
-def test_the_newest_stays_without_any_score(tmp_path: Path) -> None:
+def test_the_two_newest_stay_without_any_score(tmp_path: Path) -> None:
     for step in (1, 2, 3):
         checkpoint.save(tmp_path, step, {"x": np.ones(1)}, keep=3)
-    assert [step for step, _ in checkpoint.steps(tmp_path)] == [3]
+    assert [step for step, _ in checkpoint.steps(tmp_path)] == [2, 3]
 
 
 def test_a_relative_folder_will_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -359,3 +359,14 @@ def test_a_relative_folder_will_do(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     found = checkpoint.latest_valid(Path("runs/here"))
     assert found is not None and found[0] == 5
     np.testing.assert_array_equal(checkpoint.load(found[1], tree)["a"], tree["a"])
+
+
+def test_a_checkpoint_of_other_options_is_named_and_set_aside(tmp_path: Path) -> None:
+    tree = {"x": np.ones(1)}
+    checkpoint.save(tmp_path, 1, tree, {checkpoint.FINGERPRINT: "mine", "score": 0.1})
+    checkpoint.save(tmp_path, 2, tree, {checkpoint.FINGERPRINT: "theirs", "score": 0.9})
+    assert checkpoint.best(tmp_path, fingerprint="mine") == [(1, tmp_path / "1")]
+    assert checkpoint.latest_valid(tmp_path, fingerprint="mine") == (1, tmp_path / "1")
+    assert set_aside(tmp_path) == ["2-foreign"]
+    checkpoint.save(tmp_path, 3, tree)  # from before there were fingerprints
+    assert checkpoint.latest_valid(tmp_path, fingerprint="mine") == (3, tmp_path / "3")

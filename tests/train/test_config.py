@@ -47,6 +47,12 @@ def test_the_other_robot_is_another_one() -> None:
     assert parse(command(chosen)[3:]) == chosen
 
 
+def test_further_robots_are_named() -> None:
+    """They demonstrate, or take over from any other; no default is theirs."""
+    assert parse(["--other-robot", "xarm7"]).second_robot == "xarm7"
+    assert parse(["--robot", "xarm7"]).second_robot == "panda"
+
+
 def test_any_composition_of_shifts_is_a_domain() -> None:
     assert parse([]).domains == DOMAINS and len(DOMAINS) == 8
     given = ["in_domain", "lighting", "viewpoint_cone+object_color", "embodiment+distractors"]

@@ -150,3 +150,61 @@ class Recoloured:
     def default_params(self) -> EnvParams:
         params = make("lift_spam").default_params()
         return dataclasses.replace(params, geom_rgb=params.geom_rgb[:3])
+
+
+def test_worlds_that_do_not_fit_into_memory_are_halved_and_change_nothing() -> None:
+    told: list[str] = []
+    small, made = rooms.evaluator(16, fits=5, tell=told.append)
+    large, others = rooms.evaluator(16)
+    few, many = (
+        runs.domain(POLICY, "workspace", seed=3, count=21, aligned=False) for runs in (small, large)
+    )
+    for field in ("success", "nan", "object_xy", "camera_angle"):
+        np.testing.assert_array_equal(getattr(few, field), getattr(many, field))
+    mine, theirs = (np.concatenate(found["panda"].keys)[:21] for found in (made, others))
+    np.testing.assert_array_equal(mine, theirs)
+    assert small.runners.worlds == {"panda": 4} and large.runners.worlds == {"panda": 16}
+    assert told == [
+        "16 worlds of panda do not fit into memory; going on with 8 at a time "
+        "(RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.)",
+        "8 worlds of panda do not fit into memory; going on with 4 at a time "
+        "(RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.)",
+    ]
+    none, _ = rooms.evaluator(4, fits=0)
+    with pytest.raises(MemoryError, match="not even one world of panda fits"):
+        none.domain(POLICY, "workspace", seed=3, count=5, aligned=False)
+
+
+def test_a_scenes_noise_does_not_depend_on_the_size_of_the_batch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Tables of noise are read by rows that count from the evaluation's first scene."""
+    monkeypatch.setattr(evaluate, "NOISE_ROWS", 8)
+
+    def noise(worlds: int) -> list[tuple[bytes, int]]:
+        runs, _ = rooms.evaluator(worlds)
+        seen: list[tuple[bytes, int]] = []
+
+        def act(policy: Any, rows: np.ndarray) -> Any:
+            seen.extend((b"", int(row)) for row in rows)
+            return None
+
+        room = runs.runners.first
+        run = room.run
+
+        def noted(key: jax.Array, *arguments: Any, **options: Any) -> Any:
+            data = np.asarray(jax.random.key_data(key)).tobytes()
+            seen[-worlds:] = [(data, row) for _, row in seen[-worlds:]]
+            return run(key, *arguments, **options)
+
+        monkeypatch.setattr(type(runs), "act", lambda self, *words: act(*words))
+        monkeypatch.setattr(room, "run", noted)
+        params = repeat_params(runs.runner.env.default_params(), 20)
+        found: list[tuple[bytes, int]] = []
+        for rows, _ in runs.batches(POLICY, jax.random.key(0), params, 20):
+            found += seen[-worlds:][: len(rows)]
+        return found
+
+    first = noise(3)
+    assert len(set(first)) == 20
+    assert first == noise(5) == noise(16)

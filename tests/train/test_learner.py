@@ -314,6 +314,21 @@ def test_actions_are_executable_and_noisy(full: learner.Learner) -> None:
     assert 0 < np.abs(actions - other).max()
 
 
+def test_noise_by_rows_is_that_of_the_whole(full: learner.Learner) -> None:
+    policy, few = full.policy_state(start(full)), batch()
+
+    def act(images: Any, proprio: np.ndarray, *rows: np.ndarray) -> np.ndarray:
+        return np.asarray(full.jitted_act(jax.random.key(0), policy, images, proprio, *rows))
+
+    whole = act(few.images, few.proprio)
+    np.testing.assert_allclose(act(few.images, few.proprio, np.arange(8)), whole, atol=1e-5)
+    order = np.array([5, 2, 7, 0, 1, 6, 3, 4])
+    images = {view: x[order] for view, x in few.images.items()}
+    np.testing.assert_allclose(
+        act(images, few.proprio[order], order), np.asarray(whole)[order], atol=1e-5
+    )
+
+
 def test_acting_without_noise_is_predicting(bare: learner.Learner) -> None:
     policy, some = bare.policy_state(start(bare)), batch()
     prediction, _ = bare.jitted_predict(policy, some.images, some.proprio)

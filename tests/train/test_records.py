@@ -152,3 +152,17 @@ def test_metrics_with_damaged_lines(tmp_path: Path) -> None:
     found, complaints = records.load_metrics(path)
     assert [record["step"] for record in found] == [1, 2]
     assert len(complaints) == 1 and "1 unreadable" in complaints[0]
+
+
+def test_an_archive_whose_directory_hides_arrays_is_refused(tmp_path: Path) -> None:
+    """One byte, the length of an entry's comment, makes zipfile pass over the entries after it."""
+    cells = np.ones((1, 1, 1, 3), bool)
+    sweep = records.Sweep(np.zeros(1), np.zeros(1), np.zeros(1), cells, cells)
+    path = records.save_sweep(tmp_path / "sweep.npz", sweep)
+    content = bytearray(path.read_bytes())
+    entry = content.rindex(b"PK\x01\x02", 0, content.index(b"nan.npy", len(content) // 2))
+    before = content.rindex(b"PK\x01\x02", 0, entry)
+    content[before + 32] = len(content) - content.index(b"PK\x05\x06") + 150
+    path.write_bytes(bytes(content))
+    with pytest.raises(records.RecordError, match=r"sweep.npz: not a readable"):
+        records.load_sweep(path)

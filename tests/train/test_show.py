@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import oracles
 import pytest
 from PIL import Image
 
@@ -53,6 +54,12 @@ def test_moments_of_an_episode() -> None:
     )
 
 
+@pytest.mark.parametrize("view", show.VIEWS.values(), ids=list(show.VIEWS))
+def test_views_are_the_poses_of_cameras(view: tuple[tuple[float, ...], tuple[float, ...]]) -> None:
+    pose = show.looking_at(*view)
+    np.testing.assert_allclose(pose, oracles.looking_at(*map(np.array, view)), atol=1e-6)
+
+
 def test_batches_are_filled_up() -> None:
     assert list(show._batches([1, 2, 3, 4, 5], 2)) == [[1, 2], [3, 4], [5, 5]]
     assert list(show._batches([1], 3)) == [[1, 1, 1]]
@@ -73,6 +80,9 @@ class StubStudio:
     def expert(self, seed: int) -> tuple[list[np.ndarray], list[str]]:
         return [self.grey(50), self.grey(90), self.grey(130)], ["start", "middle", "end"]
 
+    def portraits(self, seed: int) -> list[np.ndarray]:
+        return [self.grey(110)] * (len(show.VIEWS) + 1)
+
     def close(self) -> None:
         pass
 
@@ -80,12 +90,12 @@ class StubStudio:
 def test_files(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Through the command, with a stub for the renderer: the four kinds of files, and that the
+    """Through the command, with a stub for the renderer: the five kinds of files, and that the
     shift is in the pictures (a camera of 40 and of 48 degrees: grey 167 and 200)."""
     monkeypatch.setattr(show, "Studio", StubStudio)
     words = ["--tasks", "lift_lid", "--robots", "panda", "ur5", "--out", str(tmp_path / "new")]
     assert show.main([*words, "--domains", "in_domain", "field_of_view"]) == 0
-    names = ["worlds.png", "axes.png", "methods.png", "lift_lid.png"]
+    names = ["worlds.png", "robots.png", "axes.png", "methods.png", "lift_lid.png"]
     printed = capsys.readouterr().out.splitlines()
     assert {str(tmp_path / "new" / name) for name in names} <= set(printed)
     levels = {name: np.asarray(Image.open(tmp_path / "new" / name).convert("L")) for name in names}
@@ -93,5 +103,6 @@ def test_files(
     cell = 190 * 190
     counts = {name: np.bincount(level.ravel(), minlength=256) for name, level in levels.items()}
     assert counts["worlds.png"][[167, 200]].min() > 2 * cell
+    assert counts["robots.png"][110] > 2 * len(show.VIEWS) * cell
     assert counts["axes.png"][133] > cell and counts["axes.png"][200] > cell
     assert counts["lift_lid.png"][[50, 90, 130]].min() > 2 * cell

@@ -2,13 +2,17 @@
 
 import dataclasses
 import json
+import os
+import signal
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from palm_jax.train import config as configuration
-from palm_jax.train import records, table, table_page
+from palm_jax.train import locks, records, table, table_page
 from palm_jax.train.config import Config, ConfigError
 from palm_jax.train.table import TableConfig
 
@@ -56,6 +60,7 @@ def run(config: TableConfig) -> int:
     words = ["--preset", config.preset, "--tasks", *config.tasks, "--methods", *config.methods]
     words += ["--seeds", *map(str, config.seeds), "--shard", config.shard]
     words += ["--out", str(config.folder), "--json", str(config.file)]
+    words += ["--take-over"] if config.take_over else []
     if config.merge:
         words += ["--merge", *map(str, config.merge)]
     return table.main(words)
@@ -193,3 +198,75 @@ def test_what_does_not_exist_is_refused(change: dict, words: str) -> None:
     with pytest.raises(ConfigError, match="unknown|expected") as error:
         table.cells(dataclasses.replace(SMALL, **change))
     assert words in str(error.value)
+
+
+def test_two_processes_never_run_the_same_cell(
+    tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What another one has claimed is left to it; what it finished meanwhile is not done again."""
+    config = dataclasses.replace(SMALL, out=tmp_path, seeds=(0,), methods=("palm",))
+    other = tmp_path / "lift_lid/palm-s0"
+    other.mkdir(parents=True)
+    here = locks.Process.own()
+    claim = {"processes": [dataclasses.asdict(here)], "since": "noon"}
+    (other / locks.CLAIM).write_text(json.dumps({**claim, "host": locks.host()}))
+    assert run(config) == 0 and trainer.asked == ["lift_spam/palm-s0"]
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"in use since noon by process {here.pid} on this machine" in said
+    # Of another machine: only when told.
+    (other / locks.CLAIM).write_text(json.dumps({**claim, "host": "elsewhere"}))
+    assert run(config) == 0 and len(trainer.asked) == 1
+    said = " ".join(capsys.readouterr().out.split())
+    assert "on elsewhere, which cannot be seen from here" in said and "--take-over" in said
+    assert run(dataclasses.replace(config, take_over=True)) == 0
+    assert trainer.asked[1:] == ["lift_lid/palm-s0"] and not (other / locks.CLAIM).exists()
+
+
+def test_a_file_that_another_process_wrote_meanwhile_keeps_its_cells(
+    tmp_path: Path, trainer: Trainer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = dataclasses.replace(SMALL, out=tmp_path, seeds=(0,), methods=("palm",))
+
+    def beside(asked: Config, log: Path) -> int:
+        if asked.task == "lift_lid":  # a second command runs while the first trains
+            monkeypatch.setattr(table, "_train", trainer)
+            assert run(dataclasses.replace(config, tasks=("lift_spam",))) == 0
+        return trainer(asked, log)
+
+    monkeypatch.setattr(table, "_train", beside)
+    assert run(config) == 0
+    assert sorted(trainer.asked) == ["lift_lid/palm-s0", "lift_spam/palm-s0"]
+    assert set(json.loads(config.file.read_text())["results"]) == {"lift_lid", "lift_spam"}
+    assert len(records.load_eval(table_page.episodes_file(config.file))) == 2
+
+
+STUBBORN = """
+import signal, sys, time
+def save(*_):
+    print("saved"); sys.exit(130)
+signal.signal(signal.SIGTERM, save)
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_lets_the_running_cell_save(
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = table.cell_config(
+        dataclasses.replace(SMALL, out=tmp_path), table.Cell("lift_lid", "palm", 0)
+    )
+    log = tmp_path / "cell.log"
+    monkeypatch.setattr(configuration, "command", lambda *_, **__: ["python", "-c", STUBBORN])
+
+    def when_ready() -> None:
+        while not log.exists() or "ready\n" not in log.read_text().splitlines(keepends=True):
+            time.sleep(0.01)
+        os.kill(os.getpid(), number)
+
+    threading.Thread(target=when_ready).start()
+    with pytest.raises(KeyboardInterrupt):
+        table._train(config, log)
+    assert log.read_text().endswith("saved\n")

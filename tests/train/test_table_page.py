@@ -84,6 +84,11 @@ def test_the_command_beside_a_policy_is_its_own(page: str) -> None:
         assert getattr(same, name) == getattr(wanted, name)
 
 
+def test_what_was_not_run_is_said(page: str) -> None:
+    line = next(line for line in page.splitlines() if line.startswith("Not complete: "))
+    assert "PALM (Lift Spam, Rearrange Veggies)" in line and "ARRO (every task)" in line
+
+
 def test_what_failed_is_said(page: str) -> None:
     assert "Failed, and in no number above: Lift Lid, ARRO, seed 0." in page
 

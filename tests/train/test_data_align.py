@@ -1,0 +1,617 @@
+"""`data align`: what it writes is what slow references compute, is resumable, and is verified."""
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import datasets
+import h5py
+import numpy as np
+import oracles
+import pytest
+from scipy.spatial.transform import Rotation
+
+from palm_jax.align import AlignSpec
+from palm_jax.train import data
+from palm_jax.train.data import aligning, job, output, robomimic_writer, soundness
+from palm_jax.train.data.errors import DataError, OutputError, TruncatedError
+from palm_jax.train.data.job import Options
+from palm_jax.train.data.recording import Recording, open_recording
+
+SPEC = aligning.paper_spec(128)
+"""The same for most tests: it is compiled once."""
+
+OURS = {
+    "obs/palm_image": ((84, 84, 3), np.uint8),
+    "obs/palm_proprio": ((8,), np.float32),
+    "obs/palm_valid": ((), np.bool_),
+    "obs/palm_tcp": ((4, 4), np.float32),
+    "obs/palm_opening": ((), np.float32),
+    "palm_actions": ((10,), np.float32),
+}
+
+
+@pytest.fixture
+def lift() -> Iterator[Recording]:
+    with open_recording(datasets.LIFT, datasets.robosuite()) as recording:
+        yield recording
+
+
+@pytest.fixture(scope="module")
+def aligned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("aligned") / "lift.hdf5"
+    with open_recording(datasets.LIFT, datasets.robosuite()) as recording:
+        data.align_file(recording, SPEC, path)
+    return path
+
+
+def arrays(path: Path, episode: str = "demo_0") -> dict[str, np.ndarray]:
+    found = {}
+    with h5py.File(path) as file:
+
+        def note(name: str, item: Any) -> None:
+            if isinstance(item, h5py.Dataset):
+                found[name] = item[()]
+
+        file[f"data/{episode}"].visititems(note)
+    return found
+
+
+def poses(episode: str) -> np.ndarray:
+    """Of the hand, by h5py and SciPy."""
+    with h5py.File(datasets.LIFT) as file:
+        demo = file[f"data/{episode}/obs"]
+        turns = Rotation.from_quat(demo["robot0_eef_quat"][()]).as_matrix()
+        return np.stack(
+            [oracles.pose(r, p) for r, p in zip(turns, demo["robot0_eef_pos"][()], strict=True)]
+        )
+
+
+def camera() -> tuple[np.ndarray, np.ndarray]:
+    """K and pose that robosuite wrote."""
+    with h5py.File(datasets.LIFT) as file:
+        info = json.loads(file["data/demo_0"].attrs["camera_info"])["agentview"]
+    return np.array(info["intrinsics"]), np.array(info["extrinsics"])
+
+
+def expected_image(image: np.ndarray, tcp: np.ndarray) -> np.ndarray:
+    """Overlay, crop and resize one after the other, slowly."""
+    K, pose = camera()
+    drawn = oracles.draw_overlay(
+        image, K, pose, tcp, SPEC.axis_length, int(SPEC.thickness), SPEC.arrow_length,
+        SPEC.arrow_width, int(SPEC.dot_radius),
+    )  # fmt: skip
+    uv = oracles.project(K, pose, tcp[:3, 3])[0]
+    assert SPEC.crop is not None
+    return oracles.resize(oracles.crop(drawn, uv, SPEC.crop, SPEC.offset), 84, 84)
+
+
+# -- what is computed ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("episode", ["demo_0", "demo_1"])
+def test_against_slow_references(aligned: Path, episode: str) -> None:
+    got, tcp = arrays(aligned, episode), poses(episode)
+    images = datasets.frames(datasets.LIFT, episode)
+    for name, (shape, dtype) in OURS.items():
+        assert got[name].shape == (len(tcp), *shape) and got[name].dtype == dtype, name
+    assert got["obs/palm_valid"].all()
+    _, pose = camera()
+    for frame in range(0, len(tcp), 5):
+        image = expected_image(images[frame], tcp[frame])
+        # Truncated, and line rasterisers differ: see the tolerances of the overlay.
+        assert np.abs(got["obs/palm_image"][frame] - image).mean() < 3
+        sixd = oracles.rotation_6d(pose[:3, :3].T @ tcp[frame, :3, :3])
+        opening = got["obs/palm_opening"][frame]
+        expected = [*sixd, tcp[frame, 2, 3], float(opening > 0.95)]
+        np.testing.assert_allclose(got["obs/palm_proprio"][frame], expected, atol=1e-5)
+    ends = [*tcp[1:], tcp[-1]]
+    deltas = [oracles.delta(now, then) for now, then in zip(tcp, ends, strict=True)]
+    np.testing.assert_allclose(got["palm_actions"][:, :9], deltas, atol=2e-5)
+    labels = oracles.gripper_labels(got["obs/palm_opening"])
+    np.testing.assert_array_equal(got["palm_actions"][:, 9], labels)
+
+
+def test_the_stream_is_what_the_file_holds(aligned: Path, lift: Recording) -> None:
+    for episode in data.aligned_episodes(lift, SPEC):
+        got = arrays(aligned, episode.name)
+        for name in ("image", "proprio", "valid", "tcp", "opening"):
+            value = getattr(episode, {"image": "images"}.get(name, name))
+            np.testing.assert_array_equal(got[f"obs/palm_{name}"], value)
+        np.testing.assert_array_equal(got["palm_actions"], episode.actions)
+        assert episode.camera.height == 128
+    (only,) = data.aligned_episodes(lift, SPEC, episodes=["demo_1"])
+    assert only.name == "demo_1"
+
+
+def test_labels_do_not_depend_on_the_padding(lift: Recording) -> None:
+    trajectory = lift.trajectory("demo_1")
+    every = aligning.labels(trajectory)
+    short = dataclasses.replace(trajectory, tcp=trajectory.tcp[:9], opening=trajectory.opening[:9])
+    np.testing.assert_array_equal(aligning.labels(short)[:8], every[:8])
+    np.testing.assert_allclose(
+        aligning.labels(short)[8, :9], [1, 0, 0, 0, 1, 0, 0, 0, 0], atol=1e-6
+    )
+    longest = int(np.argmax(np.linalg.norm(every[:, 6:9], axis=1)))
+    over = aligning.labels(trajectory, transitions=1)
+    np.testing.assert_array_equal(over[longest, :9], [1, 0, 0, 0, 1, 0, 0, 0, 0])
+    assert (over[np.arange(len(over)) != longest] == every[np.arange(len(over)) != longest]).all()
+
+
+@pytest.mark.parametrize("flip", ["ud", "lr", "180", "cw", "ccw"])
+def test_flipped_images_give_the_same(flip: str, lift: Recording) -> None:
+    turn: Callable[[np.ndarray], np.ndarray] = {
+        "ud": np.flipud, "lr": np.fliplr, "180": lambda i: np.rot90(i, 2),
+        "cw": lambda i: np.rot90(i, 1), "ccw": lambda i: np.rot90(i, -1),
+    }[flip]  # fmt: skip
+    images = datasets.frames(datasets.LIFT)[:8]
+    stored = np.stack([turn(image) for image in images])
+    trajectory, calibrated = lift.trajectory("demo_0"), lift.camera
+    turned = dataclasses.replace(calibrated, flip=flip)
+    args = (turned.camera(), trajectory.tcp[:8], trajectory.opening[:8], SPEC)
+    got = aligning.align_frames(turned.upright(stored), *args)
+    np.testing.assert_array_equal(got.image, aligning.align_frames(images, *args).image)
+
+
+def test_distorted_images_are_undistorted_first(lift: Recording) -> None:
+    from palm_jax.align import align, undistort
+
+    images, trajectory = datasets.frames(datasets.LIFT)[:3], lift.trajectory("demo_0")
+    dist, view = (-0.2, 0.05, 0.0, 0.0), lift.camera.camera()
+    got = aligning.align_frames(
+        images, view, trajectory.tcp[:3], trajectory.opening[:3], SPEC, dist=dist
+    )
+    for frame, image in enumerate(images):
+        clean = undistort(image, view.K, dist)
+        expected = align(clean, view, trajectory.tcp[frame], trajectory.opening[frame], SPEC)
+        difference = np.abs(np.asarray(expected.image, int) - got.image[frame])
+        assert difference.max() <= 1  # fused, sums may round to the other side
+
+
+def test_a_camera_that_moved_between_episodes(tmp_path: Path) -> None:
+    """The file says where the camera stood in each episode; each is aligned with its own."""
+
+    def move(file: h5py.File) -> None:
+        attributes = file["data/demo_1"].attrs
+        info = json.loads(attributes["camera_info"])
+        info["agentview"]["extrinsics"][2][3] += 0.1
+        attributes["camera_info"] = json.dumps(info)
+
+    path = datasets.changed(datasets.LIFT, tmp_path, move)
+    with open_recording(path, datasets.robosuite(path)) as recording:
+        found = {e.name: e for e in data.aligned_episodes(recording, SPEC)}
+    heights = [e.camera.cam_to_world[2, 3] for e in found.values()]
+    assert heights[1] - heights[0] == pytest.approx(0.1, abs=1e-6)
+
+
+def test_the_paper_scales_with_the_frame() -> None:
+    assert aligning.paper_spec(512) == AlignSpec()
+    half = aligning.paper_spec(256, size=64, layout="z")
+    assert (half.crop, half.offset, half.dot_radius, half.size) == (100, (0, 20), 2, 64)
+
+
+def test_reading_ahead_passes_everything_on() -> None:
+    assert list(aligning.ahead(range(20))) == list(range(20))
+
+    def broken() -> Iterator[int]:
+        yield 1
+        raise TruncatedError("here")
+
+    items = aligning.ahead(broken())
+    assert next(items) == 1
+    with pytest.raises(TruncatedError, match="here"):
+        next(items)
+    endless = aligning.ahead(iter(int, 1))
+    next(endless)
+    endless.close()  # type: ignore[attr-defined]
+
+
+# -- what is written -------------------------------------------------------------------------------
+
+
+def test_the_rest_is_kept_as_it_was(aligned: Path) -> None:
+    before, after = arrays(datasets.LIFT), arrays(aligned)
+    assert set(after) - set(before) == set(OURS)
+    assert set(before) - set(after) == {datasets.IMAGES}
+    for key in set(before) & set(after):
+        np.testing.assert_array_equal(before[key], after[key], err_msg=key)
+    with h5py.File(datasets.LIFT) as old, h5py.File(aligned) as new:
+        assert new["data"].attrs["total"] == 33
+        for key, value in old["data/demo_0"].attrs.items():
+            assert new["data/demo_0"].attrs[key] == value
+
+
+def test_provenance(aligned: Path) -> None:
+    with h5py.File(aligned) as file:
+        made = json.loads(file["data"].attrs["palm"])
+    assert made["source"]["sha256"] and made["source"]["name"] == datasets.LIFT.name
+    assert made["calibration_sha256"] == datasets.robosuite().sha256
+    assert made["spec"]["crop"] == 50 and made["options"]["keep"] == "numbers"
+    assert set(made["versions"]) == {"palm_jax", "python", "jax", "numpy", "h5py"}
+    assert made["robot"]["pose"] == "robot0_eef_pos+robot0_eef_quat"
+
+
+def test_keeping_everything_under_the_usual_names(lift: Recording, tmp_path: Path) -> None:
+    out = tmp_path / "all.hdf5"
+    data.align_file(lift, SPEC, out, Options(keep="all", instead=True, compression="none"))
+    before, after = arrays(datasets.LIFT), arrays(out)
+    np.testing.assert_array_equal(after["source_actions"], before["actions"])
+    np.testing.assert_array_equal(after[datasets.IMAGES], before[datasets.IMAGES])
+    assert after["actions"].shape == (15, 10) and "palm_actions" not in after
+    assert data.verify(out) == {}
+
+
+def test_keeping_nothing_with_filter_keys(tmp_path: Path) -> None:
+    def mask(file: h5py.File) -> None:
+        file["mask/train"] = np.array([b"demo_1", b"demo_7"])
+
+    path = datasets.changed(datasets.LIFT, tmp_path, mask)
+    with open_recording(path, datasets.robosuite()) as recording:
+        data.align_file(recording, SPEC, tmp_path / "none.hdf5", Options(keep="none", prefix="p"))
+    found = arrays(tmp_path / "none.hdf5")
+    assert set(found) == {name.replace("palm_", "p_") for name in OURS}
+    with h5py.File(tmp_path / "none.hdf5") as file:
+        assert list(file["mask/train"][()]) == [b"demo_1"]
+
+
+def test_an_aligned_file_can_be_aligned_again(aligned: Path) -> None:
+    """Its poses are known; robomimic's readers and this one see the same keys."""
+    from palm_jax.train.data.recording import robot_keys
+
+    with data.open_source(aligned) as source:
+        assert source.image_keys == ["obs/palm_image"]
+        keys = robot_keys(source, data.RobotKeys(pose="palm_tcp", opening="palm_opening"))
+    assert (keys.rotation, keys.open) == ("matrix", 1.0)
+
+
+# -- LeRobot ---------------------------------------------------------------------------------------
+
+
+def table_of(root: Path, name: str) -> dict[str, Any]:
+    import pyarrow.parquet as pq
+
+    return pq.read_table(root / name).to_pydict()
+
+
+@pytest.mark.parametrize("encoding", ["png", "h264"])
+def test_lerobot_layout(encoding: str, aligned: Path, lift: Recording, tmp_path: Path) -> None:
+    """Checked with pyarrow, PIL and PyAV alone."""
+    import io
+
+    import av
+    import pyarrow.parquet as pq
+    from PIL import Image
+
+    root = tmp_path / "set"
+    data.align_file(lift, SPEC, root, Options(format="lerobot", encoding=encoding))
+    info = json.loads((root / "meta/info.json").read_text())
+    assert info["codebase_version"] == "v3.0" and info["total_frames"] == 33
+    assert info["total_episodes"] == 2 and info["splits"] == {"train": "0:2"}
+    assert all("/" not in name for name in info["features"])
+    data_file = info["data_path"].format(chunk_index=0, file_index=0)
+    columns = table_of(root, data_file)
+    schema = pq.read_schema(root / data_file)
+    wanted = {k for k, f in info["features"].items() if f["dtype"] != "video"}
+    assert set(columns) == wanted
+    assert columns["index"] == list(range(33))
+    assert columns["episode_index"] == [0] * 15 + [1] * 18
+    assert columns["frame_index"] == [*range(15), *range(18)]
+    np.testing.assert_allclose(columns["timestamp"][:15], np.arange(15) * 0.15, atol=1e-6)
+    assert schema.field("observation.palm_proprio").type.list_size == 8
+    assert pq.ParquetFile(root / data_file).num_row_groups == 2
+    first, second = arrays(aligned, "demo_0"), arrays(aligned, "demo_1")
+    for ours, theirs in (
+        ("obs/palm_proprio", "observation.palm_proprio"),
+        ("palm_actions", "action.palm"),
+        ("obs/palm_valid", "observation.palm_valid"),
+        ("actions", "action"),
+        ("obs/cube_pos", "observation.cube_pos"),
+    ):
+        both = np.concatenate([first[ours], second[ours]])
+        np.testing.assert_array_equal(columns[theirs], both)
+    images = np.concatenate([first["obs/palm_image"], second["obs/palm_image"]])
+    key = "observation.images.palm"
+    rows = table_of(root, "meta/episodes/chunk-000/file-000.parquet")
+    assert rows["length"] == [15, 18] and rows["dataset_from_index"] == [0, 15]
+    assert rows["tasks"] == [["Lift"], ["Lift"]] and rows["dataset_to_index"] == [15, 33]
+    if encoding == "png":
+        got = [np.asarray(Image.open(io.BytesIO(item["bytes"]))) for item in columns[key]]
+        np.testing.assert_array_equal(got, images)
+    else:
+        got = []
+        for number in range(2):
+            assert rows[f"videos/{key}/from_timestamp"][number] == 0
+            place = {k: rows[f"videos/{key}/{k}"][number] for k in ("chunk_index", "file_index")}
+            name = info["video_path"].format(video_key=key, **place)
+            with av.open(str(root / name)) as video:
+                got += [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+        error = np.abs(np.array(got, int) - images)
+        assert len(got) == 33 and error.mean() < 8
+    stats = json.loads((root / "meta/stats.json").read_text())
+    proprio = np.concatenate([first["obs/palm_proprio"], second["obs/palm_proprio"]]).astype(float)
+    for name in ("min", "max", "mean", "std"):
+        expected = getattr(proprio, name)(0)
+        np.testing.assert_allclose(stats["observation.palm_proprio"][name], expected, atol=1e-9)
+    mean = (images / 255).mean((0, 1, 2)).reshape(3, 1, 1)
+    np.testing.assert_allclose(stats[key]["mean"], mean, atol=1e-9)
+    np.testing.assert_allclose(
+        stats[key]["std"], (images / 255).std((0, 1, 2)).reshape(3, 1, 1), atol=1e-9
+    )
+    assert stats[key]["count"] == [33]
+    tasks = pq.read_table(root / "meta/tasks.parquet")
+    assert tasks.to_pydict() == {"task_index": [0], "task": ["Lift"]}
+    note = json.loads(tasks.schema.metadata[b"pandas"])
+    assert note["index_columns"] == ["task"]
+    made = json.loads((root / "meta/palm.json").read_text())
+    assert made["calibration_sha256"] == datasets.robosuite().sha256
+    assert data.verify(root) == {}
+    assert not list(root.parent.glob(".*"))
+
+
+@pytest.fixture(scope="module")
+def front(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return datasets.lerobot(tmp_path_factory.mktemp("front"))
+
+
+def test_from_lerobot_and_back(front: Path, aligned: Path, tmp_path: Path) -> None:
+    """The same recording, in a video: the same numbers, nearly the same images."""
+    for options, out in (
+        (Options(format="robomimic"), tmp_path / "back.hdf5"),
+        (Options(keep="all", instead=True), tmp_path / "set"),
+    ):
+        with open_recording(front, datasets.lerobot_calibration()) as recording:
+            data.align_file(recording, SPEC, out, options)
+        assert data.verify(out, robot=datasets.lerobot_calibration().robot) == {}
+    got, expected = arrays(tmp_path / "back.hdf5"), arrays(aligned)
+    np.testing.assert_allclose(got["obs/palm_proprio"], expected["obs/palm_proprio"], atol=1e-5)
+    np.testing.assert_allclose(got["palm_actions"], expected["palm_actions"], atol=1e-4)
+    np.testing.assert_allclose(got["actions"], expected["actions"], atol=1e-6)
+    difference = got["obs/palm_image"].astype(int) - expected["obs/palm_image"]
+    assert np.abs(difference).mean() < 3
+    columns = table_of(tmp_path / "set", "data/chunk-000/file-000.parquet")
+    np.testing.assert_array_equal(columns["action"][:15], got["palm_actions"])
+    np.testing.assert_array_equal(columns["observation.state"][:15], got["obs/palm_proprio"])
+    before = table_of(front, "data/chunk-000/file-000.parquet")
+    assert columns["source_state"] == before["observation.state"]
+    assert columns["source_action"] == before["action"]
+    (video,) = front.rglob("*.mp4")
+    copied = tmp_path / "set" / video.relative_to(front)
+    assert copied.read_bytes() == video.read_bytes()
+    rows = table_of(tmp_path / "set", "meta/episodes/chunk-000/file-000.parquet")
+    starts = rows["videos/observation.images.front/from_timestamp"]
+    assert starts == [0.0, pytest.approx(0.75)]
+
+
+# -- stopping and going on -------------------------------------------------------------------------
+
+
+def same(first: Path, second: Path) -> None:
+    """Two outputs hold the same, bit for bit."""
+    if first.is_dir():
+        names = sorted(p.relative_to(first) for p in first.rglob("*") if p.is_file())
+        assert names == sorted(p.relative_to(second) for p in second.rglob("*") if p.is_file())
+        for name in names:
+            assert (first / name).read_bytes() == (second / name).read_bytes(), name
+        return
+    for episode in ("demo_0", "demo_1"):
+        one, other = arrays(first, episode), arrays(second, episode)
+        assert set(one) == set(other)
+        for key, value in one.items():
+            np.testing.assert_array_equal(value, other[key], err_msg=key)
+
+
+class Stop:
+    """Progress that presses Ctrl-C after so many frames."""
+
+    def __init__(self, after: int):
+        self.left = after
+
+    def __call__(self, frames: int) -> None:
+        self.left -= frames
+        if self.left < 0:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("format", ["robomimic", "lerobot"])
+@pytest.mark.parametrize("after", [0, 20])
+def test_stopped_and_resumed(format: str, after: int, tmp_path: Path) -> None:
+    options = Options(format=format)
+    source, whole, stopped = datasets.LIFT, tmp_path / "whole", tmp_path / "stopped"
+    before = datasets.digest(source)
+
+    def run(out: Path, **more: Any) -> job.Result:
+        with open_recording(source, datasets.robosuite()) as recording:
+            return data.align_file(recording, SPEC, out, options, **more)
+
+    run(whole)
+    with pytest.raises(KeyboardInterrupt):
+        run(stopped, progress=Stop(after))
+    assert not stopped.exists() and output.partial_path(stopped).exists()
+    with (
+        open_recording(source, datasets.robosuite()) as recording,
+        pytest.raises(OutputError, match="begun with spec = .*delete it"),
+    ):
+        other = dataclasses.replace(SPEC, size=64)
+        data.align_file(recording, other, stopped, options)
+    result = run(stopped)
+    assert result.resumed == (1 if after else 0)
+    same(whole, stopped)
+    assert datasets.digest(source) == before
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
+@pytest.mark.parametrize("damage", ["cut", "episode"])
+def test_a_damaged_partial_is_made_again(damage: str, aligned: Path, tmp_path: Path) -> None:
+    """Killed without a chance to close the file, or bits that flipped since."""
+    out = tmp_path / "out.hdf5"
+    partial = output.partial_path(out)
+    with open_recording(datasets.LIFT, datasets.robosuite()) as recording:
+        with pytest.raises(KeyboardInterrupt):
+            data.align_file(recording, SPEC, out, progress=Stop(20))
+        if damage == "cut":
+            partial.write_bytes(partial.read_bytes()[:20_000])
+        else:
+            with h5py.File(partial, "r+") as file:
+                file["data/demo_0/obs/palm_proprio"][3, 2] += 0.1
+        assert data.align_file(recording, SPEC, out).resumed == 0
+    same(aligned, out)
+
+
+def test_outputs_are_never_overwritten(lift: Recording, aligned: Path, front: Path) -> None:
+    with pytest.raises(OutputError, match="not overwritten"):
+        data.align_file(lift, SPEC, aligned)
+    with (
+        open_recording(front, datasets.lerobot_calibration()) as recording,
+        pytest.raises(OutputError, match="inside the source"),
+    ):
+        data.align_file(recording, SPEC, front / "new")
+
+
+@pytest.mark.parametrize(
+    ("spec", "options", "words"),
+    [
+        ({"crop": 200}, {}, "--crop: expected at most the 128 x 128"),
+        ({"isolate": True}, {}, "no masks"),
+        ({"size": 83}, {"format": "lerobot", "encoding": "h264"}, "even number"),
+        ({}, {"format": "lerobot", "keep": "all"}, "within one format"),
+    ],
+)
+def test_options_that_cannot_be(
+    spec: dict, options: dict, words: str, lift: Recording, tmp_path: Path
+) -> None:
+    with pytest.raises(DataError, match=words):
+        data.align_file(
+            lift, dataclasses.replace(SPEC, **spec), tmp_path / "new", Options(**options)
+        )
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(OutputError, match="compression: expected one of gzip, lzf, none"):
+        Options(compression="zip")
+
+
+# -- verify and repair -----------------------------------------------------------------------------
+
+
+def test_flipped_bits_are_found(aligned: Path, tmp_path: Path) -> None:
+    path = tmp_path / "flipped.hdf5"
+    shutil.copyfile(aligned, path)
+    assert data.verify(path) == {}
+    with h5py.File(path, "r+") as file:
+        file["data/demo_1/obs/palm_image"][4, 30, 30, 1] ^= 1
+    (problem,) = data.verify(path)["demo_1"]
+    assert "obs/palm_image is not what was written" in problem
+
+
+def test_verify_finds_what_does_not_add_up(tmp_path: Path) -> None:
+    def spoil(file: h5py.File) -> None:
+        file["data"].attrs["total"] = 99
+        file["data/demo_0/obs/robot0_eef_pos"][3] = np.nan
+        demo = file["data/demo_1"]
+        datasets.replace(demo, datasets.IMAGES, demo[datasets.IMAGES][:-2])
+        datasets.replace(demo, "obs/robot0_joint_pos", demo["obs/robot0_joint_pos"][:-1])
+
+    path = datasets.changed(datasets.LIFT, tmp_path, spoil)
+    problems = data.verify(path)
+    assert problems[""] == ["total is 99, not 33"]
+    assert "NaN or infinity in 1 frames from 3 on" in problems["demo_0"][0]
+    assert f"{datasets.IMAGES} has 16 images, expected 18" in problems["demo_1"]
+    assert "obs/robot0_joint_pos has 17 rows, expected 18" in problems["demo_1"]
+
+
+def test_repair_leaves_the_unsound_out(tmp_path: Path) -> None:
+    def spoil(file: h5py.File) -> None:
+        file["data/demo_0/obs/robot0_eef_pos"][3] = np.nan
+        file["data/demo_1"].attrs["num_samples"] = 5
+        file["mask/valid"] = np.array([b"demo_0", b"demo_1"])
+
+    path = datasets.changed(datasets.LIFT, tmp_path, spoil)
+    before = datasets.digest(path)
+    result = data.repair(path, tmp_path / "new.hdf5")
+    assert result.kept == ("demo_1",) and "NaN" in result.dropped["demo_0"]
+    assert data.verify(tmp_path / "new.hdf5") == {} and datasets.digest(path) == before
+    original, saved = arrays(datasets.LIFT, "demo_1"), arrays(tmp_path / "new.hdf5")
+    for key, value in original.items():
+        np.testing.assert_array_equal(saved[key], value)
+    with h5py.File(tmp_path / "new.hdf5") as file:
+        assert list(file["mask/valid"][()]) == [b"demo_0"]
+        assert file["data"].attrs["total"] == 18
+        assert json.loads(file["data"].attrs["palm_repair"])["dropped"]["demo_0"]
+
+
+@pytest.mark.parametrize("share", [0.55, 0.7, 0.9])
+@pytest.mark.parametrize("compressed", [True, False])
+def test_repair_of_a_cut_file_takes_nothing_for_zeros(
+    share: float, compressed: bool, tmp_path: Path
+) -> None:
+    whole = tmp_path / "whole.hdf5"
+    shutil.copyfile(datasets.LIFT, whole)
+    if not compressed:
+        whole.unlink()
+        with h5py.File(datasets.LIFT) as old, h5py.File(whole, "w") as new:
+            for name in ("demo_0", "demo_1"):
+                old.copy(old[f"data/{name}"], new.require_group("data"), name=name)
+                images = old[f"data/{name}/{datasets.IMAGES}"][()]
+                datasets.replace(new[f"data/{name}"], datasets.IMAGES, images)
+    content = whole.read_bytes()
+    cut = tmp_path / "cut.hdf5"
+    cut.write_bytes(content[: int(share * len(content))])
+    try:
+        result = data.repair(cut, tmp_path / "saved.hdf5")
+    except (TruncatedError, OutputError):
+        assert not (tmp_path / "saved.hdf5").exists()
+        return
+    assert data.verify(tmp_path / "saved.hdf5") == {}
+    for number, name in enumerate(result.kept):
+        saved = arrays(tmp_path / "saved.hdf5", f"demo_{number}")
+        for key, value in arrays(datasets.LIFT, name).items():
+            np.testing.assert_array_equal(saved[key], value, err_msg=key)
+
+
+@pytest.mark.parametrize("kind", ["robosuite", "aligned"])
+def test_a_cut_file_from_which_something_can_be_saved(
+    kind: str, aligned: Path, tmp_path: Path
+) -> None:
+    """The second episode lies at the end."""
+    content = (aligned if kind == "aligned" else datasets.LIFT).read_bytes()
+    cut = tmp_path / "cut.hdf5"
+    cut.write_bytes(content[: int(0.8 * len(content))])
+    result = data.repair(cut, tmp_path / "saved.hdf5")
+    assert result.kept == ("demo_0",) and "beyond the end" in result.dropped["demo_1"]
+
+
+def test_repair_of_lerobot(tmp_path: Path) -> None:
+    root = datasets.lerobot(tmp_path, short_video=3)
+    robot = datasets.lerobot_calibration().robot
+    assert "15 images, expected 18" in data.verify(root, robot=robot)["1"][0]
+    result = data.repair(root, tmp_path / "saved", robot=robot)
+    assert result.kept == ("0",) and list(result.dropped) == ["1"]
+    assert data.verify(tmp_path / "saved", robot=robot) == {}
+    before = table_of(root, "data/chunk-000/file-000.parquet")
+    after = table_of(tmp_path / "saved", "data/chunk-000/file-000.parquet")
+    assert after["observation.state"] == before["observation.state"][:15]
+    with data.open_source(tmp_path / "saved") as saved, data.open_source(root) as old:
+        key = "observation.images.front"
+        for got, expected in zip(saved.blocks("0", key, 8), old.blocks("0", key, 8), strict=True):
+            np.testing.assert_array_equal(got, expected)
+
+
+def test_nothing_to_repair(tmp_path: Path) -> None:
+    def spoil(file: h5py.File) -> None:
+        file["data/demo_0/obs/robot0_eef_quat"][0, 1] = np.inf
+
+    path = datasets.changed(datasets.CAN, tmp_path, spoil)
+    with pytest.raises(OutputError, match="no sound episode to save .*demo_0"):
+        soundness.repair(path, tmp_path / "new.hdf5")
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_checksums_do_not_depend_on_blocks() -> None:
+    values = np.arange(60, dtype=np.float32).reshape(20, 3)
+    whole, parts = output.Digest(), output.Digest()
+    whole.add(values)
+    for first in range(0, 20, 7):
+        parts.add(values[first : first + 7])
+    assert whole.hex() == parts.hex()
+    assert robomimic_writer.CHECKSUMS == "palm_sha256"

@@ -1,0 +1,447 @@
+"""calibration.json: what is in it, what is refused, and where it comes from."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import datasets
+import h5py
+import mujoco
+import numpy as np
+import oracles
+import pytest
+from scipy.spatial.transform import Rotation
+
+from palm_jax.align import project
+from palm_jax.train.data import calibration as calib
+from palm_jax.train.data import commands, importers, motion, rotations
+from palm_jax.train.data.calibration import Calibration, CameraCalibration
+from palm_jax.train.data.errors import (
+    CalibrationError,
+    CameraNameError,
+    DataError,
+    EulerAmbiguityError,
+    FormatError,
+    ImageSizeError,
+    PoseDataError,
+)
+from palm_jax.train.data.source import open_source
+
+POSE = oracles.looking_at(np.array([1.0, -0.4, 1.5]), np.array([0.2, 0.1, 0.8]))
+K = np.array([[600.0, 0.0, 330.0], [0.0, 610.0, 235.0], [0.0, 0.0, 1.0]])
+
+
+def camera(**changes) -> CameraCalibration:
+    return dataclasses.replace(CameraCalibration("front", K, 640, 480, POSE), **changes)
+
+
+def content(**changes) -> dict:
+    entry = Calibration({"front": camera()}).to_json()
+    for place, value in changes.items():
+        *path, last = place.split("__")
+        target = entry
+        for part in path:
+            target = target[part]
+        target[last] = value
+    return entry
+
+
+# -- orientations ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("reading", "numbers"),
+    [
+        ("euler_xyz", lambda r: r.as_euler("xyz")),
+        ("euler_XYZ", lambda r: r.as_euler("XYZ")),
+        ("quat_xyzw", lambda r: r.as_quat()),
+        ("quat_wxyz", lambda r: r.as_quat(scalar_first=True)),
+        ("rotvec", lambda r: r.as_rotvec()),
+        ("rot6d", lambda r: np.swapaxes(r.as_matrix()[..., :2], 1, 2).reshape(-1, 6)),
+    ],
+)
+def test_orientations_read_as_scipy_writes_them(reading: str, numbers) -> None:
+    rotation = Rotation.random(20, rng=np.random.default_rng(0))
+    position = np.arange(60.0).reshape(20, 3)
+    poses = rotations.poses(np.concatenate([position, numbers(rotation)], 1), reading)
+    np.testing.assert_allclose(poses[:, :3, :3], rotation.as_matrix(), atol=1e-12)
+    np.testing.assert_array_equal(poses[:, :3, 3], position)
+    again = rotations.poses(poses.reshape(20, 16), "matrix")
+    np.testing.assert_array_equal(again, poses)
+
+
+def test_apart_is_the_angle_between() -> None:
+    first, second = Rotation.from_euler("z", 0.3), Rotation.from_euler("z", 1.1)
+    angle = rotations.apart(first.as_matrix()[None], second.as_matrix()[None])
+    assert angle == pytest.approx(np.degrees(0.8))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "reading", "error", "words"),
+    [
+        (np.full((3, 6), np.nan), "euler_xyz", PoseDataError, "NaN or infinity in 3 frames"),
+        (np.ones((3, 7)), "quat_xyzw", PoseDataError, "length 1, got lengths from 2"),
+        (np.ones((3, 7)), "euler_xyz", FormatError, r"expected 3 \+ 3 numbers"),
+        (np.ones((3, 6)), "yaw", FormatError, "known: euler_xyz"),
+        (np.ones((3, 12)), "matrix", FormatError, "4 x 4"),
+    ],
+)
+def test_numbers_that_are_no_poses(numbers, reading: str, error: type, words: str) -> None:
+    with pytest.raises(error, match=words):
+        rotations.poses(numbers, reading)
+
+
+@pytest.mark.parametrize("order", ["xyz", "XYZ"])
+def test_a_pose_reread_in_the_other_order(order: str) -> None:
+    """What `data check` tries: the same three angles, read as the other order."""
+    angles = np.array([-2.1, 0.3, 1.2])
+    other = "XYZ" if order == "xyz" else "xyz"
+    pose = oracles.pose(Rotation.from_euler(other, angles).as_matrix(), np.zeros(3))
+    reading = motion.Reading("none", euler=order)
+    again = motion.pose_as(pose, reading)[:3, :3]
+    np.testing.assert_allclose(again, Rotation.from_euler(order, angles).as_matrix(), atol=1e-9)
+
+
+# -- the file --------------------------------------------------------------------------------------
+
+
+def test_the_file_comes_back_as_it_was(tmp_path: Path) -> None:
+    other = oracles.looking_at(np.array([0.9, 0.5, 1.2]), np.array([0.2, 0.1, 0.8]))
+    whole = Calibration(
+        {"front": camera(dist=(0.1, 0.0, 0.0, 0.01), flip="180", by_episode={"demo_3": other})},
+        oracles.pose(np.eye(3), np.array([0.0, 0.0, 0.1])),
+        calib.RobotKeys("state[0:7]", "quat_wxyz", "state[7]", 0.1, 0.9),
+        "hand",
+    )
+    path = calib.save(whole, tmp_path / "calibration.json")
+    again = calib.load(path)
+    assert again.to_json() == whole.to_json() and again.sha256 == whole.sha256
+    found = again.cameras["front"]
+    np.testing.assert_allclose(found.camera("demo_3").cam_to_world, other, atol=1e-6)
+    np.testing.assert_allclose(found.camera("demo_4").cam_to_world, POSE, atol=1e-6)
+    assert json.loads(path.read_text())["cameras"]["front"]["T_base_cam"] == POSE.tolist()
+    moved = dataclasses.replace(whole, made_from="elsewhere")
+    assert moved.sha256 == whole.sha256
+    assert dataclasses.replace(whole, ee_to_tcp=np.eye(4)).sha256 != whole.sha256
+
+
+MIRROR = (POSE @ np.diag([1.0, -1.0, 1.0, 1.0])).tolist()
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        ({"format": "palm-calib/2"}, CalibrationError, "expected 'palm-calib/1'"),
+        ({"axes": "opengl"}, CalibrationError, "--axes opengl"),
+        ({"cameras": {}}, CalibrationError, "at least one"),
+        ({"cameras__front": 3}, CalibrationError, "expected an object"),
+        ({"cameras__front__mount": "wrist"}, CalibrationError, "stands still"),
+        ({"cameras__front__K": None}, CalibrationError, "cameras.front.K: missing"),
+        ({"cameras__front__K": [[1.0]]}, CalibrationError, "3 x 3"),
+        ({"cameras__front__K": (-K).tolist()}, CalibrationError, "positive focal"),
+        ({"cameras__front__K": K.T.tolist()}, CalibrationError, "transposed"),
+        ({"cameras__front__K": "no"}, CalibrationError, "expected numbers"),
+        ({"cameras__front__width": 0}, CalibrationError, "number of pixels"),
+        ({"cameras__front__width": 320}, ImageSizeError, "another resolution"),
+        ({"cameras__front__flip": "left"}, CalibrationError, "none, ud, lr"),
+        ({"cameras__front__dist": [0.1]}, CalibrationError, "4, 5, 8"),
+        ({"cameras__front__dist": [None] * 5}, CalibrationError, "finite|numbers"),
+        ({"cameras__front__T_base_cam": MIRROR}, CalibrationError, r"det = -1"),
+        ({"cameras__front__T_base_cam": (2 * POSE).tolist()}, CalibrationError, "T_base_cam"),
+        ({"cameras__front__T_base_cam": POSE[:3].tolist()}, CalibrationError, "4 x 4"),
+        ({"cameras__front__T_base_cam": POSE.T.tolist()}, CalibrationError, "last column"),
+        ({"cameras__front__by_episode": {"a": MIRROR}}, CalibrationError, "by_episode.a"),
+        ({"T_ee_tcp": MIRROR}, CalibrationError, "T_ee_tcp"),
+        ({"robot": {"hand": 1}}, CalibrationError, "unknown entries hand"),
+    ],
+)
+def test_what_is_refused(changes: dict, error: type, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(content(**changes)))
+    with pytest.raises(error, match=words) as caught:
+        calib.load(path)
+    assert str(path) in str(caught.value) and isinstance(caught.value, CalibrationError)
+
+
+def test_no_file_and_no_json(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="data calibrate --from robosuite"):
+        calib.load(tmp_path / "none.json")
+    (tmp_path / "cut.json").write_text('{"format": "palm-')
+    with pytest.raises(CalibrationError, match="not a readable JSON"):
+        calib.load(tmp_path / "cut.json")
+
+
+# -- pixels ----------------------------------------------------------------------------------------
+
+
+def test_rescaled_cameras_see_the_same_at_other_pixels() -> None:
+    points = np.random.default_rng(0).uniform((0, -0.3, 0.7), (0.5, 0.3, 1.0), (9, 3))
+    uv, _ = project(camera().camera(), points)
+    small, _ = project(camera().rescaled(320, 240).camera(), points)
+    np.testing.assert_allclose(2 * np.asarray(small), uv, atol=1e-3)
+    assert camera().rescaled(427, 320).width == 427  # 426.67 rounded
+    with pytest.raises(ImageSizeError, match="cropped or padded"):
+        camera().rescaled(256, 256)
+
+
+@pytest.mark.parametrize("flip", list(calib.FLIPS))
+def test_flips_of_images_and_of_pixels_agree(flip: str) -> None:
+    upright = np.zeros((48, 64, 3), np.uint8)
+    u, v = 51, 7
+    upright[v, u] = 200
+    stored = {
+        "none": upright, "ud": np.flipud(upright), "lr": np.fliplr(upright),
+        "180": np.rot90(upright, 2), "cw": np.rot90(upright, 1), "ccw": np.rot90(upright, -1),
+    }[flip]  # fmt: skip
+    small = dataclasses.replace(camera(), width=64, height=48, K=np.diag([60.0, 60, 1]), flip=flip)
+    np.testing.assert_array_equal(small.upright(stored), upright)
+    (row,), (column,) = np.nonzero(stored[..., 0])
+    place = motion.stored_uv(flip, np.array([u + 0.5, v + 0.5]), 64, 48)
+    np.testing.assert_array_equal(place, [column + 0.5, row + 0.5])
+    with pytest.raises(ImageSizeError, match="--rescale 32 24"):
+        small.upright(np.zeros((24, 32, 3), np.uint8))
+
+
+def test_which_images_belong_to_a_camera() -> None:
+    both = Calibration({"front": camera(), "side": camera(name="side")})
+    keys = ["obs/front_image", "observation.images.side", "obs/other_image"]
+    assert both.find("front", keys)[1] == "obs/front_image"
+    assert both.find("side", keys)[1] == "observation.images.side"
+    with pytest.raises(CameraNameError, match="choose one with --camera"):
+        both.find(None, keys)
+    assert both.find(None, keys[:1])[0].name == "front"
+    with pytest.raises(CameraNameError, match="'top' is not in the calibration.*front, side"):
+        both.find("top", keys)
+    with pytest.raises(CameraNameError, match='as "image"'):
+        both.find(None, keys[2:])
+    named = Calibration({"front": camera(image="obs/other_image")})
+    assert named.find(None, keys)[1] == "obs/other_image"
+
+
+# -- importers -------------------------------------------------------------------------------------
+
+
+def options(kind: str, **values) -> commands.Calibrate:
+    return commands.Calibrate(kind, Path("unused.json"), **values)  # type: ignore[arg-type]
+
+
+def test_robosuite_says_the_same_in_both_ways(tmp_path: Path) -> None:
+    """camera_info was computed by robosuite; model_file is compiled and read by MuJoCo here."""
+
+    def forget(file: h5py.File) -> None:
+        for demo in file["data"].values():
+            del demo.attrs["camera_info"]
+
+    told = datasets.robosuite().cameras["agentview"]
+    path = datasets.changed(datasets.LIFT, tmp_path, forget)
+    compiled = datasets.robosuite(path).cameras["agentview"]
+    np.testing.assert_allclose(compiled.cam_to_base, told.cam_to_base, atol=1e-5)
+    np.testing.assert_allclose(compiled.K, told.K, rtol=1e-6)
+    assert (compiled.width, compiled.height) == (told.width, told.height) == (128, 128)
+
+    def move(file: h5py.File) -> None:
+        for demo in file["data"].values():
+            del demo.attrs["model_file"]
+
+    (tmp_path / "again").mkdir()
+    bare = datasets.changed(path, tmp_path / "again", move)
+    with pytest.raises(CalibrationError, match="neither camera_info nor model_file"):
+        datasets.robosuite(bare)
+
+
+def test_a_camera_that_stands_elsewhere_in_one_episode(tmp_path: Path) -> None:
+    def move(file: h5py.File) -> None:
+        attributes = file["data/demo_1"].attrs
+        info = json.loads(attributes["camera_info"])
+        info["agentview"]["extrinsics"][0][3] += 0.25
+        attributes["camera_info"] = json.dumps(info)
+
+    found = datasets.robosuite(datasets.changed(datasets.LIFT, tmp_path, move))
+    camera = found.cameras["agentview"]
+    assert list(camera.by_episode) == ["demo_1"]
+    shift = camera.camera("demo_1").cam_to_world - camera.camera("demo_0").cam_to_world
+    np.testing.assert_allclose(shift[:, 3], [0.25, 0, 0, 0], atol=1e-6)
+
+
+MODEL = """<mujoco><compiler meshdir="/nowhere"/><asset><mesh name="m" file="absent.stl"/></asset>
+<default><camera fovy="50"/><geom density="3"/></default>
+<worldbody><geom type="mesh" mesh="m"/>
+  <body pos="0.1 0.2 0.3" euler="10 20 30"><camera name="high" pos="0 0 1" euler="0 20 0"/></body>
+  <camera name="low" pos="1 0 .4" xyaxes="0 1 0 -.4 0 1" fovy="45"/>
+  <body name="arm"><joint type="hinge"/><geom size=".1"/><camera name="hand"/></body>
+</worldbody><actuator><motor joint="x"/></actuator></mujoco>"""
+
+
+def test_mujoco_models_without_their_files() -> None:
+    found = importers.from_mujoco(MODEL, [], (640, 480))
+    assert set(found) == {"high", "low"}
+    clean = mujoco.MjModel.from_xml_string(
+        MODEL.replace('<mesh name="m" file="absent.stl"/>', "")
+        .replace('<geom type="mesh" mesh="m"/>', "")
+        .replace('<motor joint="x"/>', "")
+    )
+    data = mujoco.MjData(clean)
+    mujoco.mj_forward(clean, data)
+    for name, camera in found.items():
+        index = clean.camera(name).id
+        axes = data.cam_xmat[index].reshape(3, 3)
+        expected = oracles.pose(axes * [1, -1, -1], data.cam_xpos[index])
+        np.testing.assert_allclose(camera.cam_to_base, expected, atol=1e-9)
+        half = np.tan(np.radians(clean.cam_fovy[index] / 2))
+        assert camera.K[1, 1] * half == pytest.approx(240) and camera.K[0, 2] == 320
+    assert found["low"].K[1, 1] != pytest.approx(found["high"].K[1, 1])
+    with pytest.raises(CalibrationError, match="hangs on a joint"):
+        importers.from_mujoco(MODEL, ["hand"], (640, 480))
+    with pytest.raises(CameraNameError, match="it has low, high"):
+        importers.from_mujoco(MODEL, ["top"], (640, 480))
+    with pytest.raises(CalibrationError, match="--size"):
+        importers.from_mujoco(MODEL, ["low"], None)
+    for text, words in (("<a>", "not a readable MJCF"), ("<a/>", "not an MJCF")):
+        with pytest.raises(CalibrationError, match=words):
+            importers.from_mujoco(text, [], (640, 480))
+
+
+GL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def sensor(**changes) -> dict:
+    arrays = {"intrinsic_cv": K, "extrinsic_cv": np.linalg.inv(POSE)[:3], "cam2world_gl": POSE @ GL}
+    return {k: v for k, v in (arrays | changes).items() if v is not None}
+
+
+@pytest.mark.parametrize("changes", [{}, {"cam2world_gl": None}, {"extrinsic_cv": None}])
+@pytest.mark.parametrize("kind", ["hdf5", "json"])
+def test_maniskill(changes: dict, kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"sensors.{kind}"
+    arrays = sensor(**changes)
+    if kind == "json":
+        path.write_text(json.dumps({"base_camera": {k: v.tolist() for k, v in arrays.items()}}))
+    else:
+        with h5py.File(path, "w") as file:
+            for key, value in arrays.items():
+                place = f"traj_0/obs/sensor_param/base_camera/{key}"
+                file[place] = np.repeat(value[None].astype(np.float32), 5, 0)
+    made = commands.make_calibration(options("maniskill", file=path, size=(640, 480)))
+    found = made.cameras["base_camera"]
+    np.testing.assert_allclose(found.cam_to_base, POSE, atol=1e-5)
+    np.testing.assert_allclose(found.K, K, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"cam2world_gl": POSE}, "contradict each other"),
+        ({"intrinsic_cv": None}, "needs intrinsic_cv"),
+        ({"extrinsic_cv": np.stack([POSE, POSE @ oracles.pose(np.eye(3), np.ones(3))])}, "moves"),
+    ],
+)
+def test_maniskill_that_cannot_be(changes: dict, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "sensors.json"
+    entry = {key: np.asarray(value).tolist() for key, value in sensor(**changes).items()}
+    path.write_text(json.dumps({"front": entry}))
+    with pytest.raises(CalibrationError, match=words):
+        commands.make_calibration(options("maniskill", file=path, size=(640, 480)))
+    with pytest.raises(CameraNameError, match="only front"):
+        importers.from_maniskill(path, None, ["side"], (640, 480))
+
+
+VECTOR = "0.4,-0.5,0.6,-2.1,0.3,1.2"
+
+
+@pytest.mark.parametrize("order", ["xyz", "XYZ"])
+def test_droid_reads_angles_as_told(order: str) -> None:
+    config = options(
+        "droid", camera=("front",), K="600,610,330,235", size=(640, 480), extrinsics=VECTOR,
+        euler=order,
+    )  # fmt: skip
+    found = commands.make_calibration(config).cameras["front"]
+    angles = [float(text) for text in VECTOR.split(",")]
+    expected = oracles.pose(Rotation.from_euler(order, angles[3:]).as_matrix(), angles[:3])
+    np.testing.assert_allclose(found.cam_to_base, expected, atol=1e-12)
+    np.testing.assert_array_equal(found.K, K)
+
+
+def test_droid_does_not_choose_by_itself() -> None:
+    config = options(
+        "droid", camera=("front",), K="600,610,330,235", size=(640, 480), extrinsics=VECTOR
+    )
+    with pytest.raises(EulerAmbiguityError, match=r"euler_xyz .* or euler_XYZ .* degrees apart"):
+        commands.make_calibration(config)
+
+
+@pytest.mark.parametrize("axes", ["opencv", "opengl", "coppelia"])
+@pytest.mark.parametrize("inverse", [False, True])
+def test_arrays(axes: str, inverse: bool, tmp_path: Path) -> None:
+    turn = {
+        "opencv": np.eye(4),
+        "opengl": GL,
+        "coppelia": np.diag([-1.0, -1.0, 1.0, 1.0]),
+    }[axes]
+    stored = np.linalg.inv(POSE @ turn) if inverse else POSE @ turn
+    np.save(tmp_path / "pose.npy", stored[:3])
+    np.save(tmp_path / "K.npy", K)
+    config = options(
+        "npy", camera=("front",), K=str(tmp_path / "K.npy"), size=(640, 480), axes=axes,
+        extrinsics=str(tmp_path / "pose.npy"), inverse=inverse, dist="0.1 0 0 0 0",
+        pixel_origin="centre",
+    )  # fmt: skip
+    found = commands.make_calibration(config).cameras["front"]
+    np.testing.assert_allclose(found.cam_to_base, POSE, atol=1e-9)
+    np.testing.assert_array_equal(found.K[:2, 2], K[:2, 2] + 0.5)
+    assert found.dist == (0.1, 0.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "error", "words"),
+    [
+        ("npy", {}, CalibrationError, "name it with --camera"),
+        ("npy", {"camera": ("a",)}, CalibrationError, "--K"),
+        ("npy", {"camera": ("a",), "K": "1,2"}, CalibrationError, "fx,fy,cx,cy"),
+        ("npy", {"camera": ("a",), "K": "f.npy"}, FormatError, "cannot be read"),
+        ("npy", {"camera": ("a",), "K": "x"}, FormatError, "expected numbers"),
+        ("npy", {"camera": ("a",), "K": "5,5,1,1"}, CalibrationError, "--size"),
+        (
+            "npy",
+            {"camera": ("a",), "K": "5,5,1,1", "size": (4, 4)},
+            CalibrationError,
+            "--extrinsics",
+        ),
+        ("robosuite", {}, CalibrationError, "needs a --file"),
+        ("mujoco", {"file": Path("absent.xml")}, CalibrationError, "cannot be read"),
+        ("robosuite", {"file": datasets.LIFT, "camera": ("side",)}, CameraNameError, "agentview"),
+    ],
+)
+def test_options_that_are_missing(kind: str, values: dict, error: type, words: str) -> None:
+    with pytest.raises(error, match=words) as caught:
+        commands.make_calibration(options(kind, **values))
+    assert isinstance(caught.value, DataError)
+
+
+def test_changing_a_calibration(tmp_path: Path) -> None:
+    path = calib.save(datasets.robosuite(), tmp_path / "first.json")
+    before = calib.load(path).cameras["agentview"]
+    config = options(
+        "palm", file=path, flip="ud", rescale=(64, 64), axes="opengl", tcp_turn=90.0,
+        tcp_offset=(0.0, 0.0, 0.01), opening="grip", closed=1.0, open=0.0,
+    )  # fmt: skip
+    changed = commands.make_calibration(config)
+    after = changed.cameras["agentview"]
+    assert after.flip == "ud" and after.width == 64
+    np.testing.assert_allclose(after.K[:2] * 2, before.K[:2])
+    np.testing.assert_allclose(after.cam_to_base, before.cam_to_base @ GL)
+    expected = oracles.pose(Rotation.from_euler("z", np.pi / 2).as_matrix(), [0, 0, 0.01])
+    np.testing.assert_allclose(changed.ee_to_tcp, expected, atol=1e-12)
+    assert changed.robot.opening == "grip" and changed.robot.closed == 1.0
+    kept = commands.make_calibration(options("palm", file=path))
+    assert kept.to_json() == calib.load(path).to_json()
+
+
+def test_sources_name_their_keys_and_columns() -> None:
+    with open_source(datasets.LIFT) as source:
+        assert source.resolve("robot0_eef_pos") == "obs/robot0_eef_pos"
+        columns = source.columns("demo_0", "robot0_eef_pos[1:3]+robot0_gripper_qpos[0]")
+        position = source.numbers("demo_0", "obs/robot0_eef_pos")
+        gripper = source.numbers("demo_0", "obs/robot0_gripper_qpos")
+        np.testing.assert_array_equal(columns, np.c_[position[:, 1:], gripper[:, :1]])
+        with pytest.raises(FormatError, match="has 3 columns"):
+            source.columns("demo_0", "robot0_eef_pos[2:5]")

@@ -1,0 +1,270 @@
+"""`data check`: the reprojection error, which mistake it names, the sheet; and the command line."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import datasets
+import h5py
+import numpy as np
+import oracles
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from palm_jax.__main__ import main
+from palm_jax.train.data import aligning, calibration, check, commands, motion
+from palm_jax.train.data.calibration import Calibration
+from palm_jax.train.data.recording import Recording, open_recording
+
+SAMPLES = [datasets.LIFT, datasets.CAN]
+
+
+def with_camera(path: Path, **changes) -> Calibration:
+    found = datasets.robosuite(path)
+    camera = dataclasses.replace(found.cameras["agentview"], **changes)
+    return dataclasses.replace(found, cameras={"agentview": camera})
+
+
+def posed(path: Path, turn) -> Calibration:
+    """The pose of the camera replaced by `turn(pose)`."""
+    pose = datasets.robosuite(path).cameras["agentview"].cam_to_base
+    return with_camera(path, cam_to_base=turn(pose))
+
+
+@pytest.mark.parametrize("path", SAMPLES, ids=lambda path: path.stem)
+def test_the_tcp_is_where_robosuite_renders_it(path: Path) -> None:
+    """Against pixels that robosuite's renderer showed the grip site at, without any matrix."""
+    with open_recording(path, datasets.robosuite(path)) as recording:
+        report = check.check(recording)
+        assert report.problem is None and report.motion.tells
+        assert report.survey.in_view == 1.0 and report.survey.behind == 0.0
+        found = report.reprojection
+        assert found is not None and found.frames == report.survey.frames
+        assert found.mean < 0.1 and found.most < 0.2
+        distances = []
+        with h5py.File(path) as file:
+            for demo in file["data"].values():
+                info = json.loads(demo.attrs["camera_info"])["agentview"]
+                matrices = np.array(info["intrinsics"]), np.array(info["extrinsics"])
+                uv, _ = oracles.project(*matrices, demo["obs/robot0_eef_pos"][()])
+                seen = demo["obs/agentview_tcp_uv"][()]
+                distances += list(np.linalg.norm(uv - seen, axis=1))
+        assert found.mean == pytest.approx(np.mean(distances), abs=1e-5)
+        assert found.most == pytest.approx(np.max(distances), abs=1e-5)
+
+
+@pytest.mark.parametrize("flip", ["ud", "lr", "180", "cw", "ccw"])
+@pytest.mark.parametrize("path", SAMPLES, ids=lambda path: path.stem)
+def test_flips_are_named(path: Path, flip: str) -> None:
+    """The calibration says that the images are flipped, and they are not."""
+    with open_recording(path, with_camera(path, flip=flip)) as recording:
+        report = check.check(recording)
+    assert report.motion.best.reading == motion.Reading("none")
+    assert type(report.problem).__name__ == "ImageOrientationError"
+    assert "--flip none" in str(report.problem)
+
+
+@pytest.mark.parametrize("flip", ["ud", "lr", "180"])
+def test_flipped_files_are_named(flip: str, tmp_path: Path) -> None:
+    images = calibration.FLIPS[flip](datasets.frames(datasets.CAN))
+    path = datasets.changed(
+        datasets.CAN,
+        tmp_path,
+        lambda file: datasets.replace(file["data/demo_0"], datasets.IMAGES, images),
+    )
+    with open_recording(path, datasets.robosuite(path)) as recording:
+        report = check.check(recording)
+    assert f"--flip {flip} --out" in str(report.problem)
+    with open_recording(path, with_camera(path, flip=flip)) as recording:
+        assert check.check(recording).problem is None
+
+
+GL = np.diag([1.0, -1.0, -1.0, 1.0])
+MISTAKES = {
+    "inverted": (np.linalg.inv, "--flip none --inverse --out", "inverted"),
+    "opengl": (lambda pose: pose @ GL, "--flip none --axes opengl --out", "OpenGL"),
+    "inverted, opengl": (lambda pose: np.linalg.inv(pose @ GL), "--inverse", "OpenGL"),
+}
+
+
+@pytest.mark.parametrize("mistake", list(MISTAKES))
+@pytest.mark.parametrize("path", SAMPLES, ids=lambda path: path.stem)
+def test_readings_of_the_pose_are_named(path: Path, mistake: str) -> None:
+    turn, command, words = MISTAKES[mistake]
+    with open_recording(path, posed(path, turn)) as recording:
+        report = check.check(recording)
+    best = report.motion.best
+    assert report.problem is not None
+    readings = [best.reading, *best.same]
+    texts = [check.told(reading) for reading in readings]
+    commands_ = [check.remedy(reading) for reading in readings]
+    assert any(command in line for line in commands_), commands_
+    assert any(words in text for text in texts), texts
+    # Taken at its word, the remedy gives the right camera back.
+    pose = posed(path, turn).cameras["agentview"].cam_to_base
+    fits = [
+        np.abs(
+            motion.pose_as(pose, reading)
+            - posed(path, lambda p: p).cameras["agentview"].cam_to_base
+        ).max()
+        for reading in readings
+        if reading.flip == "none"
+    ]
+    assert min(fits) < 1e-6
+
+
+@pytest.mark.parametrize("wrong", ["xyz", "XYZ"])
+def test_the_order_of_angles_is_named(wrong: str) -> None:
+    """Six numbers written in one order and imported in the other."""
+    right = "XYZ" if wrong == "xyz" else "xyz"
+    pose = datasets.robosuite(datasets.CAN).cameras["agentview"].cam_to_base
+    # robosuite's camera has angles that mean the same in both orders: roll it a little.
+    pose = pose @ oracles.pose(Rotation.from_euler("zx", [0.35, 0.1]).as_matrix(), np.zeros(3))
+    angles = Rotation.from_matrix(pose[:3, :3]).as_euler(right)
+    misread = oracles.pose(Rotation.from_euler(wrong, angles).as_matrix(), pose[:3, 3])
+    reading = motion.Reading("none", euler=right)
+    np.testing.assert_allclose(motion.pose_as(misread, reading), pose, atol=1e-9)
+    assert f"--euler {right}" in check.remedy(reading)
+
+
+def test_a_hand_that_stands_still_tells_nothing(tmp_path: Path) -> None:
+    def freeze(file: h5py.File) -> None:
+        demo = file["data/demo_0"]
+        for key in (datasets.IMAGES, "obs/robot0_eef_pos"):
+            demo[key][...] = demo[key][:1]
+
+    path = datasets.changed(datasets.CAN, tmp_path, freeze)
+    with open_recording(path, with_camera(path, flip="ud")) as recording:
+        report = check.check(recording)
+    assert report.motion.pairs == 0 and not report.motion.tells and report.problem is None
+
+
+def test_noise_is_not_taken_for_a_flip(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, datasets.frames(datasets.CAN).shape, np.uint8)
+    path = datasets.changed(
+        datasets.CAN,
+        tmp_path,
+        lambda file: datasets.replace(file["data/demo_0"], datasets.IMAGES, noise),
+    )
+    with open_recording(path, datasets.robosuite(path)) as recording:
+        assert not motion.examine(recording).wrong
+
+
+def test_areas_are_averaged() -> None:
+    picture = np.random.default_rng(0).uniform(size=(120, 97))
+    pooled = motion._pooled(picture, 48)
+    assert pooled.shape == (48, 48)
+    rows, columns = np.arange(49) * 120 // 48, np.arange(49) * 97 // 48
+    for i, j in ((0, 0), (13, 20), (47, 47)):
+        area = picture[rows[i] : rows[i + 1], columns[j] : columns[j + 1]]
+        assert pooled[i, j] == pytest.approx(area.mean())
+
+
+# -- the sheet -------------------------------------------------------------------------------------
+
+
+def drawn(recording: Recording, path: Path) -> Image.Image:
+    report = check.check(recording)
+    check.sheet(recording, report, aligning.paper_spec(128), path)
+    with Image.open(path) as picture:
+        return picture.convert("RGB")
+
+
+def test_the_sheet_shows_the_overlay_where_the_hand_is(tmp_path: Path) -> None:
+    with open_recording(datasets.CAN, datasets.robosuite(datasets.CAN)) as recording:
+        picture = drawn(recording, tmp_path / "good.png")
+        name, index = check._chosen(recording)[0]
+    panel = check.PANEL + check.CAPTION
+    assert picture.size == (4 * check.PANEL, check.CAPTION + 3 * panel)
+    with h5py.File(datasets.CAN) as file:
+        u, v = file[f"data/{name}/obs/agentview_tcp_uv"][index] * check.PANEL / 128
+    dot = np.asarray(picture)[check.CAPTION + round(v), round(u)]
+    assert (dot == 255).all()
+    with open_recording(datasets.CAN, with_camera(datasets.CAN, flip="lr")) as recording:
+        both = drawn(recording, tmp_path / "flipped.png")
+    assert both.size == (picture.width, 2 * picture.height)
+
+
+def test_the_sheet_says_what_is_behind(tmp_path: Path) -> None:
+    with open_recording(datasets.CAN, posed(datasets.CAN, lambda pose: pose @ GL)) as recording:
+        assert drawn(recording, tmp_path / "behind.png").height > 1000
+
+
+# -- the command line ------------------------------------------------------------------------------
+
+
+def run(*words: object) -> int:
+    return main(["data", *map(str, words)])
+
+
+def test_ten_minutes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The commands of docs/your_data.md."""
+    monkeypatch.chdir(tmp_path)
+    assert run("inspect", datasets.CAN) == 0
+    assert "1 episodes, 31 frames" in capsys.readouterr().out
+    made = ["--from", "robosuite", "--file", datasets.CAN, "--out", "calibration.json"]
+    assert run("calibrate", *made) == 0
+    assert run("calibrate", *made) == 2
+    assert "OutputError: calibration.json exists" in capsys.readouterr().err
+    assert run("check", datasets.CAN, "--calibration", "calibration.json") == 0
+    out = capsys.readouterr().out
+    assert "TCP in the image in 100.0%" in out and "mean 0.061 px" in out and "\ngood\n" in out
+    assert Path("robosuite_can-agentview.png").stat().st_size > 10_000
+    assert run("align", datasets.CAN, "--calibration", "calibration.json", "--out", "a.hdf5") == 0
+    assert "crop 50, 84 x 84 pixels, 8 numbers" in capsys.readouterr().out
+    assert run("verify", "a.hdf5") == 0
+    assert "a.hdf5: sound" in capsys.readouterr().out
+    flipped = ["--from", "palm", "--file", "calibration.json", "--flip", "ud", "--out", "ud.json"]
+    assert run("calibrate", *flipped) == 0
+    assert run("check", datasets.CAN, "--calibration", "ud.json", "--out", "ud.png") == 1
+    assert "ImageOrientationError" in capsys.readouterr().out
+    assert run("align", datasets.CAN, "--calibration", "ud.json", "--out", "b.hdf5") == 2
+    assert "error: ImageOrientationError" in capsys.readouterr().err
+    assert not Path("b.hdf5").exists()
+    assert run("repair", "a.hdf5", "--out", "c.hdf5") == 0
+    assert "1 episodes written: c.hdf5" in capsys.readouterr().out
+
+
+def test_options_of_align() -> None:
+    config = commands.Align(
+        Path("x"), Path("c"), Path("o"), crop=60, size=64, overlay=False, layout="world6d_xyz",
+        spec='{"border": "edge"}',
+    )  # fmt: skip
+    spec = commands.make_spec(config, 128)
+    assert (spec.crop, spec.size, spec.overlay, spec.layout) == (60, 64, False, "world6d_xyz")
+    assert spec.border == "edge" and spec.dot_radius == 1
+    whole = commands.make_spec(dataclasses.replace(config, full_frame=True, spec=None), 128)
+    assert whole.crop is None
+    for text, words in (
+        ("[1]", "expected"),
+        ('{"crops": 3}', "some of arrow_length"),
+        ("n", "JSON"),
+    ):
+        with pytest.raises(commands.DataError, match=words):
+            commands.make_spec(dataclasses.replace(config, spec=text), 128)
+
+
+def test_unknown_commands_and_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("algin") == 2
+    assert "Did you mean 'align'?" in capsys.readouterr().err
+    assert run("--help") == 0
+    out = capsys.readouterr().out
+    assert all(f"\n  {name} " in out for name in commands.COMMANDS)
+
+
+def test_ctrl_c_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands.job, "align_file", stop)
+    path = calibration.save(datasets.robosuite(), tmp_path / "c.json")
+    words = ["align", datasets.LIFT, "--calibration", path, "--out", tmp_path / "new.hdf5"]
+    assert run(*words) == 130
+    out = capsys.readouterr().out
+    assert "Saved: finished episodes" in out and f"palm_jax data align {datasets.LIFT}" in out

@@ -1,0 +1,223 @@
+"""Aligning a whole file into a new one: checked first, resumable, whole or absent."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import platform
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palm_jax import __version__
+from palm_jax.align import AlignSpec
+from palm_jax.train.data import aligning, motion, output
+from palm_jax.train.data.check import check_orientation
+from palm_jax.train.data.errors import DataError, OutputError
+from palm_jax.train.data.lerobot_writer import ENCODINGS, LeRobotWriter
+from palm_jax.train.data.output import Writer
+from palm_jax.train.data.recording import LEAST_IN_VIEW, Recording, Survey, check_view
+from palm_jax.train.data.robomimic_writer import COMPRESSIONS, RobomimicWriter, writing
+from palm_jax.train.metrics import plain
+
+KEEP = ("numbers", "all", "none")
+FORMATS = ("robomimic", "lerobot")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """How the output is written.
+
+    Attributes:
+      format: "robomimic" or "lerobot"; None: the source's.
+      keep: of the source: "numbers" (all but images), "all", or "none".
+      compression: of images in HDF5: gzip (level 1), lzf or none.
+      encoding: of images in LeRobot: png (exact, in the tables), h264 or av1 (an mp4 an episode).
+      prefix: of the new keys.
+      instead: new keys under the names that learners look for (`actions`; `action`,
+        `observation.state`), the source's as source_*.
+      transitions: see `aligning.labels`.
+    """
+
+    format: str | None = None
+    keep: str = "numbers"
+    compression: str = "gzip"
+    encoding: str = "png"
+    prefix: str = "palm"
+    instead: bool = False
+    transitions: int = 0
+
+    def __post_init__(self) -> None:
+        choices = {
+            "format": (None, *FORMATS),
+            "keep": KEEP,
+            "compression": tuple(COMPRESSIONS),
+            "encoding": ENCODINGS,
+        }
+        for name, known in choices.items():
+            if getattr(self, name) not in known:
+                raise OutputError(
+                    f"{name}: expected one of {', '.join(map(str, known))}; got "
+                    f"{getattr(self, name)!r}"
+                )
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """Of `align_file`."""
+
+    path: Path
+    episodes: int
+    frames: int
+    resumed: int  # episodes that an earlier call had finished
+    in_view: float  # share of frames with the TCP in the image
+
+
+def preflight(recording: Recording, *, least: float = LEAST_IN_VIEW, trust: bool = False) -> Survey:
+    """Everything that can be found wrong before an image is aligned.
+
+    Args:
+      recording: the data with its calibration.
+      least: share of frames that must show the TCP.
+      trust: do not look at the images.
+
+    Raises:
+      DataError: see `Recording.trajectory`, `check_view`, `check_orientation`.
+    """
+    survey = recording.survey()
+    check_view(recording, survey, least=least)
+    if not trust:
+        check_orientation(recording, motion.examine(recording))
+    return survey
+
+
+def recipe(recording: Recording, spec: AlignSpec, options: Options) -> dict[str, Any]:
+    """How an output is made: what two calls must have in common to go on with each other."""
+    packages = ("jax", "numpy", "h5py")
+    content: dict[str, Any] = plain(
+        {
+            "versions": {
+                "palm_jax": __version__,
+                "python": platform.python_version(),
+                **{name: importlib.metadata.version(name) for name in packages},
+            },
+            "source": recording.source.fingerprint(),
+            "camera": recording.camera.name,
+            "images": recording.image_key,
+            "calibration_sha256": recording.calibration.sha256,
+            "calibration": recording.calibration.to_json(),
+            "robot": recording.keys,
+            "spec": spec,
+            "options": options,
+        }
+    )
+    return content
+
+
+def expected_bytes(recording: Recording, spec: AlignSpec, survey: Survey, options: Options) -> int:
+    """About how large the output will be without compression."""
+    numbers = 4 * (spec.proprio_size + 10 + 16 + 2)
+    size = survey.frames * (3 * spec.size**2 + numbers)
+    if options.keep == "all":
+        size += sum(file.stat().st_size for file in recording.source.files())
+    return size
+
+
+def align_file(
+    recording: Recording,
+    spec: AlignSpec,
+    out: Path,
+    options: Options | None = None,
+    *,
+    least: float = LEAST_IN_VIEW,
+    trust: bool = False,
+    progress: Callable[[int], None] | None = None,
+) -> Result:
+    """Writes every episode's aligned images, proprioception and labels into a new file.
+
+    Goes on where an earlier call of the same kind stopped. `out` appears when it is complete.
+
+    Args:
+      recording: the data with its calibration.
+      spec: what to do.
+      out: of the new file or folder.
+      options: how it is written.
+      least, trust: see `preflight`.
+      progress: called with the number of frames after each block.
+
+    Raises:
+      DataError: see `preflight`; `OutputError`, `DiskFullError`.
+      KeyboardInterrupt: finished episodes are kept for the next call.
+    """
+    options = options or Options()
+    output.check_free(out, recording.source.path)
+    _check_spec(recording, spec, options)
+    survey = preflight(recording, least=least, trust=trust)
+    output.check_space(out, expected_bytes(recording, spec, survey, options))
+    with writing(out):
+        writer = _writer(recording, spec, out, options)
+        try:
+            _write(recording, spec, writer, options, progress or (lambda frames: None))
+            writer.complete()
+        except KeyboardInterrupt:
+            writer.stop()
+            raise
+        except BaseException:
+            writer.discard()
+            raise
+    return Result(out, survey.episodes, survey.frames, len(writer.done), survey.in_view)
+
+
+def _check_spec(recording: Recording, spec: AlignSpec, options: Options) -> None:
+    camera = recording.camera
+    if spec.isolate:
+        raise DataError("AlignSpec.isolate: expected false, got true; data files have no masks")
+    if spec.crop is not None and spec.crop > min(camera.width, camera.height):
+        raise DataError(
+            f"--crop: expected at most the {camera.width} x {camera.height} pixels of the images, "
+            f"got {spec.crop}"
+        )
+    to = options.format or recording.source.format
+    if to == "lerobot" and options.encoding != "png" and spec.size % 2:
+        raise OutputError(f"--size: expected an even number for video, got {spec.size}")
+
+
+def _writer(recording: Recording, spec: AlignSpec, out: Path, options: Options) -> Writer:
+    made = recipe(recording, spec, options)
+    given = {"keep": options.keep, "prefix": options.prefix, "instead": options.instead}
+    if (options.format or recording.source.format) == "lerobot":
+        return LeRobotWriter(out, recording.source, made, encoding=options.encoding, **given)  # type: ignore[arg-type]
+    if options.keep == "all" and recording.source.format != "robomimic":
+        raise OutputError("--keep all copies images as they are stored: within one format only")
+    return RobomimicWriter(out, recording.source, made, compression=options.compression, **given)  # type: ignore[arg-type]
+
+
+def _write(
+    recording: Recording,
+    spec: AlignSpec,
+    writer: Writer,
+    options: Options,
+    progress: Callable[[int], None],
+) -> None:
+    finished = set(writer.done)
+    left = [name for name in recording.source.episodes if name not in finished]
+    progress(sum(recording.source.length(name) for name in finished))
+    episodes = aligning.stream(recording, spec, episodes=left, transitions=options.transitions)
+    try:
+        for name, trajectory, actions, blocks in episodes:
+            known = {
+                "actions": actions,
+                "tcp": trajectory.tcp.astype(np.float32),
+                "opening": trajectory.opening.astype(np.float32),
+            }
+            writer.begin(name, len(actions), known)
+            for image, proprio, valid in (
+                (np.asarray(b.image), np.asarray(b.proprio), np.asarray(b.valid)) for b in blocks
+            ):
+                writer.add(image, {"proprio": proprio, "valid": valid})
+                progress(len(image))
+            writer.end()
+    finally:
+        episodes.close()  # type: ignore[attr-defined]

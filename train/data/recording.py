@@ -1,0 +1,337 @@
+"""A data file seen through one calibrated camera: trajectories of the TCP, and where they appear.
+
+Nothing here reads images; a whole file is surveyed in seconds before the first of them is touched.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from palm_jax._checks import PoseError, check_pose
+from palm_jax.align import Camera
+from palm_jax.train.data import calibration as calib
+from palm_jax.train.data import rotations
+from palm_jax.train.data.calibration import Calibration, RobotKeys
+from palm_jax.train.data.errors import (
+    EpisodeLengthError,
+    EulerAmbiguityError,
+    FormatError,
+    KeyMissingError,
+    OpeningError,
+    PoseDataError,
+    TcpBehindCameraError,
+    TcpOutOfViewError,
+)
+from palm_jax.train.data.source import Source, open_source
+
+KNOWN_POSES = {
+    "robot0_eef_pos+robot0_eef_quat": "quat_xyzw",  # robosuite
+    "palm_tcp": "matrix",  # what `data align` has written
+    "tcp": "matrix",  # this package's own demonstrations
+}
+"""Keys that are understood without being told -> how their orientation reads."""
+
+KNOWN_OPENINGS = {
+    "robot0_gripper_qpos": (2, 0.0, 0.04),  # robosuite's Panda: metres a finger
+    "palm_opening": (1, 0.0, 1.0),  # what `data align` has written
+    "opening": (1, 0.0, 1.0),  # this package's own demonstrations
+    "gripper_position": (1, 1.0, 0.0),  # DROID: 0 open, 1 closed
+}
+"""Key -> number of columns, value when closed, value when open."""
+
+LEAST_IN_VIEW = 0.75
+"""Share of frames that must show the TCP, unless told otherwise."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Trajectory:
+    """The robot in one episode of T frames."""
+
+    tcp: np.ndarray  # [T, 4, 4] float64, base
+    opening: np.ndarray  # [T] float64, 0 closed to 1 open
+
+
+@dataclasses.dataclass(frozen=True)
+class Survey:
+    """Where the TCP appears, over all frames."""
+
+    episodes: int
+    frames: int
+    in_view: float  # share of frames with the TCP in front of the camera, inside the image
+    behind: float  # share with the TCP behind the camera
+    uv: tuple[np.ndarray, ...]  # one [T, 2] an episode, pixels; NaN behind the camera
+    worst: str  # the episode with the smallest share in view
+    worst_share: float
+
+
+def projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """uv [T, 2] (NaN behind the camera) and depth [T] of points [T, 3] in the base's frame.
+
+    `palm_jax.align.project` in NumPy: episodes have all lengths, and it would compile for each.
+    """
+    pose = np.asarray(camera.cam_to_world, np.float64)
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    depth = local[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uv = (local / depth[:, None]) @ np.asarray(camera.K, np.float64)[:2].T
+    return np.where((depth > 1e-4)[:, None], uv, np.nan), depth
+
+
+def inside(camera: Camera, uv: np.ndarray) -> np.ndarray:
+    """[T] bool: uv [T, 2] lies on a pixel of the image."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((uv >= 0) & (uv < [camera.width, camera.height])).all(-1))
+
+
+class Recording:
+    """A source and one camera of a calibration, checked against each other.
+
+    Attributes:
+      source: the data.
+      calibration: all of it.
+      camera: the calibrated camera.
+      image_key: of its images in the data.
+      keys: where the data has the robot's pose and gripper, nothing left open.
+
+    Raises:
+      CameraNameError, ImageSizeError: see `Calibration.find`, `CameraCalibration.upright`.
+      KeyMissingError, EulerAmbiguityError, OpeningError: the robot's keys are unknown.
+    """
+
+    def __init__(self, source: Source, calibration: Calibration, camera: str | None = None):
+        self.source, self.calibration = source, calibration
+        self.camera, self.image_key = calibration.find(camera, source.image_keys)
+        height, width, _ = source.features()[self.image_key].shape
+        self.camera.upright(np.empty((0, height, width, 3), np.uint8))
+        self.keys = robot_keys(source, calibration.robot)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.source.close()
+
+    def trajectory(self, episode: str) -> Trajectory:
+        """The robot's path in an episode.
+
+        Raises:
+          EpisodeLengthError: fewer than two frames, or arrays of different lengths.
+          PoseDataError: poses that are not finite or not rigid, a gripper that is not finite.
+          FormatError: see `rotations.poses`.
+        """
+        where = f"{self.source.path}: {episode}"
+        length = self.source.length(episode)
+        if length < 2:
+            raise EpisodeLengthError(
+                f"{where} has {length} frame{'s' * (length != 1)}; a motion needs two. Leave it "
+                f"out: `python -m palm_jax data repair {self.source.path} --out NEW`"
+            )
+        assert self.keys.pose and self.keys.rotation and self.keys.opening
+        numbers = self.source.columns(episode, self.keys.pose)
+        gripper = self.source.columns(episode, self.keys.opening)
+        for key, values in ((self.keys.pose, numbers), (self.keys.opening, gripper)):
+            if len(values) != length:
+                raise EpisodeLengthError(
+                    f"{where}: expected {length} rows in {key}, got {len(values)}; leave the "
+                    "episode out with `data repair`"
+                )
+        if not np.isfinite(gripper).all():
+            raise PoseDataError(f"{where}: {self.keys.opening} has NaN or infinity")
+        return Trajectory(self._tcp(numbers, where), self._opening(gripper))
+
+    def _tcp(self, numbers: np.ndarray, where: str) -> np.ndarray:
+        advice = "leave the episode out with `data repair`, or mend it where it was made"
+        assert self.keys.rotation is not None
+        try:
+            poses = rotations.poses(numbers, self.keys.rotation)
+        except (PoseDataError, FormatError) as error:
+            raise type(error)(f"{where}: {self.keys.pose}: {error}; {advice}") from error
+        try:
+            check_pose(poses, self.keys.pose or "")
+        except PoseError:
+            raise PoseDataError(f"{where}: {_first_problem(poses)}; {advice}") from None
+        return poses @ self.calibration.ee_to_tcp
+
+    def _opening(self, gripper: np.ndarray) -> np.ndarray:
+        closed, opened = self.keys.closed, self.keys.open
+        assert closed is not None and opened is not None
+        return np.clip((np.abs(gripper).mean(1) - closed) / (opened - closed), 0.0, 1.0)
+
+    def survey(self, episodes: Iterable[str] | None = None) -> Survey:
+        """Reads every pose and tells where the TCP appears.
+
+        Raises:
+          EpisodeLengthError, PoseDataError: see `trajectory`.
+        """
+        names = list(self.source.episodes if episodes is None else episodes)
+        uvs, shares = [], []
+        behind = seen = frames = 0
+        for name in names:
+            camera = self.camera.camera(name)
+            uv, depth = projected(camera, self.trajectory(name).tcp[:, :3, 3])
+            visible = inside(camera, uv)
+            uvs.append(uv)
+            shares.append(float(visible.mean()))
+            behind += int((depth <= 1e-4).sum())
+            seen, frames = seen + int(visible.sum()), frames + len(uv)
+        worst = int(np.argmin(shares))
+        return Survey(
+            len(names), frames, seen / frames, behind / frames, tuple(uvs), names[worst],
+            shares[worst],
+        )  # fmt: skip
+
+
+def _first_problem(poses: np.ndarray) -> str:
+    """What is wrong with the first of [T, 4, 4] that is no pose."""
+    for frame, pose in enumerate(poses):
+        try:
+            check_pose(pose, f"frame {frame}")
+        except PoseError as error:
+            return str(error)
+    return ""
+
+
+def open_recording(
+    path: Path, calibration: Calibration | Path, *, camera: str | None = None
+) -> Recording:
+    """Opens a data file with its calibration.
+
+    Args:
+      path: robomimic HDF5 file, or folder of a LeRobot v3 data set.
+      calibration: or the path of its file.
+      camera: name; None: the only one with images.
+
+    Raises:
+      DataError: see `open_source`, `calibration.load`, `Recording`.
+    """
+    checked = calibration if isinstance(calibration, Calibration) else calib.load(calibration)
+    source = open_source(path)
+    try:
+        return Recording(source, checked, camera)
+    except BaseException:
+        source.close()
+        raise
+
+
+def check_view(recording: Recording, survey: Survey, *, least: float = LEAST_IN_VIEW) -> None:
+    """Raises where the TCP is not in the images, as it is with a wrong calibration.
+
+    Raises:
+      TcpBehindCameraError, TcpOutOfViewError: with the share, and what to try.
+    """
+    where = f"{recording.source.path} with camera {recording.camera.name!r}"
+    look = "`python -m palm_jax data check` tries the usual mistakes and draws them"
+    if survey.behind > max(1 - least, 0.02):
+        raise TcpBehindCameraError(
+            f"{where}: the TCP lies behind the camera in {survey.behind:.0%} of the frames: "
+            f"T_base_cam is inverted, or its axes are not OpenCV's; {look}"
+        )
+    if survey.in_view < least:
+        raise TcpOutOfViewError(
+            f"{where}: the TCP is inside the image in {survey.in_view:.0%} of the frames, expected "
+            f"at least {least:.0%} (--least-in-view); {look}"
+        )
+
+
+# -- the robot's keys ------------------------------------------------------------------------------
+
+
+def robot_keys(source: Source, given: RobotKeys) -> RobotKeys:
+    """`given`, with what it leaves open filled in from known keys.
+
+    Raises:
+      KeyMissingError: no known key, or one that is not there.
+      EulerAmbiguityError: an orientation that can be read in several ways.
+      OpeningError: a gripper of unknown range.
+    """
+    pose = given.pose or _known(source, KNOWN_POSES)
+    if pose is None:
+        candidates = [
+            key
+            for key in source.number_keys
+            if int(np.prod(source.features()[key].shape)) in (6, 7, 9, 16)
+        ]
+        raise KeyMissingError(
+            f"{source.path}: which key is the pose of the hand? None is known by name; keys of a "
+            f"fitting size: {', '.join(candidates) or 'none'}. Write it into the calibration: "
+            "`data calibrate ... --pose 'KEY[a:b]' --rotation NAME`"
+        )
+    rotation = given.rotation or KNOWN_POSES.get(pose) or _rotation(source, pose)
+    opening, closed, opened = _gripper(source, given)
+    return RobotKeys(pose, rotation, opening, closed, opened)
+
+
+def _known(source: Source, names: Iterable[str]) -> str | None:
+    for name in names:
+        try:
+            for part in name.split("+"):
+                source.resolve(part)
+        except KeyMissingError:
+            continue
+        return name
+    return None
+
+
+def _rotation(source: Source, pose: str) -> str:
+    """How to read a pose by its number of columns alone, where that settles it."""
+    numbers = source.columns(source.episodes[0], pose)
+    count = numbers.shape[1]
+    if count in (9, 16):
+        return "rot6d" if count == 9 else "matrix"
+    pairs = {6: ("euler_xyz", "euler_XYZ"), 7: ("quat_xyzw", "quat_wxyz")}
+    if count not in pairs:
+        raise FormatError(
+            f"{source.path}: {pose} has {count} columns; expected a position and an orientation: 6 "
+            "(three angles), 7 (quaternion), 9 (two columns of the matrix) or 16 (4 x 4)"
+        )
+    raise EulerAmbiguityError(f"{source.path}: {pose}: {ambiguity(numbers, *pairs[count])}")
+
+
+def ambiguity(numbers: np.ndarray, first: str, second: str) -> str:
+    """Says that numbers [T, 3 + n] can be read in two ways, and how far those are apart."""
+    try:
+        one, other = (rotations.poses(numbers, name)[:, :3, :3] for name in (first, second))
+        distance = f"; here the two are up to {rotations.apart(one, other):.0f} degrees apart"
+    except PoseDataError:
+        distance = ""
+    meaning = {
+        "euler_xyz": "about the fixed axes, SciPy's 'xyz'",
+        "euler_XYZ": "about the hand's own axes, SciPy's 'XYZ'",
+        "quat_xyzw": "scalar last",
+        "quat_wxyz": "scalar first",
+    }
+    return (
+        f"is the orientation {first} ({meaning[first]}) or {second} "
+        f"({meaning[second]})?{distance}. Say which (for a pose --rotation, for a camera --euler); "
+        "`data check` shows whether it fits the images"
+    )
+
+
+def _gripper(source: Source, given: RobotKeys) -> tuple[str, float, float]:
+    opening = given.opening or _known(source, KNOWN_OPENINGS)
+    if opening is None:
+        raise OpeningError(
+            f"{source.path}: which key is the gripper? None is known by name. Write it into the "
+            "calibration: `data calibrate ... --opening KEY --closed VALUE --open VALUE`"
+        )
+    columns = source.columns(source.episodes[0], opening)
+    count, closed, opened = KNOWN_OPENINGS.get(opening, (0, None, None))
+    closed = given.closed if given.closed is not None else closed
+    opened = given.open if given.open is not None else opened
+    told = given.closed is not None and given.open is not None
+    if closed is None or opened is None or (columns.shape[1] != count and not told):
+        size = np.abs(columns).mean(1)
+        raise OpeningError(
+            f"{source.path}: what is {opening} when the gripper is closed, and what when open? Its "
+            f"{columns.shape[1]} columns have a mean absolute value from {size.min():.4g} to "
+            f"{size.max():.4g} in the first episode. Write it into the calibration: "
+            "`data calibrate ... --opening KEY --closed VALUE --open VALUE`"
+        )
+    if closed == opened:
+        raise OpeningError(f"{opening}: closed and open are both {closed}")
+    return opening, float(closed), float(opened)

@@ -1,0 +1,254 @@
+"""Robomimic's HDF5 files: `data/demo_i/{actions, states, obs/*}`, images uint8 [T, H, W, 3].
+
+Reading is bound by decompression where images are compressed: chunks of whole frames are then
+decompressed in threads, which h5py by itself does not do, and by `isal`, where that is installed,
+in half the time.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import re
+import zlib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from palm_jax.train.data.errors import FormatError, KeyMissingError, TruncatedError
+from palm_jax.train.data.source import Feature, Source
+
+CACHE_BYTES = 64 * 2**20
+"""For chunks that are larger than a block or cut frames into pieces."""
+
+DEFAULT_FPS = 20.0
+
+
+def _inflater() -> Any:
+    """`zlib`, or its faster twin."""
+    try:
+        return importlib.import_module("isal.isal_zlib")
+    except ImportError:
+        return zlib
+
+
+_INFLATER = _inflater()
+
+
+def by_number(name: str) -> tuple[int, str]:
+    """Sorts demo_10 after demo_9."""
+    digits = re.findall(r"\d+", name)
+    return (int(digits[-1]) if digits else -1, name)
+
+
+def open_hdf5(path: Path) -> h5py.File:
+    """The file, open for reading.
+
+    Raises:
+      TruncatedError: it ends before its header says.
+      FormatError: not readable as HDF5 for another reason.
+    """
+    try:
+        return h5py.File(path, "r", rdcc_nbytes=CACHE_BYTES)
+    except OSError as error:
+        if "truncated" in str(error):
+            raise TruncatedError(
+                f"{path}: the file ends too early ({path.stat().st_size} bytes; {_stored(error)}): "
+                "an interrupted copy or recording; copy it again, or save the whole episodes: "
+                f"`python -m palm_jax data repair {path} --out NEW`"
+            ) from error
+        raise FormatError(f"{path}: not a readable HDF5 file ({error})") from error
+
+
+def _stored(error: OSError) -> str:
+    found = re.search(r"stored_eof = (\d+)", str(error))
+    return f"its header says {found.group(1)}" if found else "its header says more"
+
+
+def is_image(dataset: h5py.Dataset) -> bool:
+    """Whether a data set of an episode holds colour images."""
+    shape, dtype = dataset.shape, dataset.dtype
+    return bool(len(shape) == 4 and shape[-1] == 3 and dtype == np.uint8 and min(shape[1:3]) > 4)
+
+
+class RobomimicSource(Source):
+    """A robomimic file. See `Source`.
+
+    Raises:
+      TruncatedError, FormatError: see `open_hdf5`; no `data` group, or no episode in it.
+    """
+
+    format = "robomimic"
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.file = open_hdf5(path)
+        self._pool: ThreadPoolExecutor | None = None
+        try:
+            self._read_header()
+        except BaseException:
+            self.file.close()
+            raise
+
+    def _read_header(self) -> None:
+        data = self.file.get("data")
+        if not isinstance(data, h5py.Group):
+            raise FormatError(
+                f"{self.path}: no group 'data': not a robomimic file (found "
+                f"{', '.join(self.file) or 'nothing'})"
+            )
+        self.data = data
+        names = [name for name in data if self._is_episode(name)]
+        if not names:
+            raise FormatError(f"{self.path}: no episode in 'data'")
+        self.episodes = tuple(sorted(names, key=by_number))
+        self.env_args = json.loads(data.attrs.get("env_args", "{}"))
+        kwargs = self.env_args.get("env_kwargs") or {}
+        self.fps = float(kwargs.get("control_freq") or data.attrs.get("fps", DEFAULT_FPS))
+        self._features = {key: _feature(dataset) for key, dataset in self.datasets(names[0])}
+
+    def _is_episode(self, name: str) -> bool:
+        try:
+            return isinstance(self.data[name], h5py.Group)
+        except (OSError, RuntimeError, KeyError):
+            return True  # one that cannot be read is an error where it is used
+
+    def demo(self, episode: str) -> h5py.Group:
+        """The group of an episode.
+
+        Raises:
+          TruncatedError: it cannot be read.
+        """
+        try:
+            return self.data[episode]
+        except (OSError, RuntimeError, KeyError) as error:
+            raise TruncatedError(
+                f"{self.path}: {episode} cannot be read ({error}); save the whole episodes: "
+                f"`python -m palm_jax data repair {self.path} --out NEW`"
+            ) from error
+
+    def datasets(self, episode: str, *, every: bool = False) -> list[tuple[str, h5py.Dataset]]:
+        """Arrays of an episode that have a row for each frame; with `every`, all there are."""
+        found: list[tuple[str, h5py.Dataset]] = []
+
+        def note(name: str, item: Any) -> None:
+            if not isinstance(item, h5py.Dataset):
+                return
+            numeric = item.dtype.kind in "biuf" and item.shape
+            if every or (numeric and not name.startswith("next_obs/")):
+                found.append((name, item))
+
+        self.demo(episode).visititems(note)
+        return found
+
+    def _dataset(self, episode: str, key: str) -> h5py.Dataset:
+        try:
+            return self.demo(episode)[key]
+        except KeyError:
+            raise KeyMissingError(
+                f"{self.path}: {episode} has no {key!r}, which the first episode has; leave the "
+                "episode out with `data repair`"
+            ) from None
+
+    def length(self, episode: str) -> int:
+        demo = self.demo(episode)
+        if "actions" in demo:
+            return len(demo["actions"])
+        if "num_samples" in demo.attrs:
+            return int(demo.attrs["num_samples"])
+        return max((len(dataset) for _, dataset in self.datasets(episode)), default=0)
+
+    def features(self) -> dict[str, Feature]:
+        return self._features
+
+    def numbers(self, episode: str, key: str) -> np.ndarray:
+        values: np.ndarray = self._read(self._dataset(episode, key), slice(None))
+        return values
+
+    def _read(self, dataset: h5py.Dataset, rows: Any) -> np.ndarray:
+        try:
+            values: np.ndarray = dataset[rows]
+        except (OSError, RuntimeError) as error:
+            raise TruncatedError(
+                f"{self.path}: {dataset.name} cannot be read ({error}); save the whole episodes: "
+                f"`python -m palm_jax data repair {self.path} --out NEW`"
+            ) from error
+        return values
+
+    def blocks(self, episode: str, key: str, size: int) -> Iterator[np.ndarray]:
+        dataset = self._dataset(episode, key)
+        per_chunk = dataset.chunks[0] if dataset.chunks else 1
+        # Whole chunks, so that none is decompressed twice.
+        size = max(1, size // per_chunk) * per_chunk
+        for first in range(0, len(dataset), size):
+            rows = slice(first, min(first + size, len(dataset)))
+            yield (
+                self._gzipped(dataset, rows) if _whole_gzip(dataset) else self._read(dataset, rows)
+            )
+
+    def _gzipped(self, dataset: h5py.Dataset, rows: slice) -> np.ndarray:
+        """Rows, decompressed in threads (zlib lets the others run, HDF5 does not)."""
+        self._pool = self._pool or ThreadPoolExecutor(min(4, os.cpu_count() or 1))
+        per_chunk, zeros = dataset.chunks[0], (0,) * (dataset.ndim - 1)
+        block = np.empty((rows.stop - rows.start, *dataset.shape[1:]), np.uint8)
+
+        def decompress(first: int, packed: bytes) -> None:
+            frames = np.frombuffer(_INFLATER.decompress(packed), np.uint8)
+            frames = frames.reshape(dataset.chunks)[: rows.stop - first]
+            block[first - rows.start : first - rows.start + len(frames)] = frames
+
+        jobs = []
+        for first in range(rows.start, rows.stop, per_chunk):
+            try:
+                mask, packed = dataset.id.read_direct_chunk((first, *zeros))
+            except (OSError, RuntimeError):
+                return self._read(dataset, rows)  # never written: zeros, or the error with advice
+            if mask:  # this chunk was stored without the filter
+                return self._read(dataset, rows)
+            jobs.append(self._pool.submit(decompress, first, packed))
+        try:
+            for job in jobs:
+                job.result()
+        except (_INFLATER.error, ValueError):
+            return self._read(dataset, rows)  # raises, with advice
+        return block
+
+    def image(self, episode: str, key: str, index: int) -> np.ndarray:
+        return self._read(self._dataset(episode, key), index)
+
+    def camera_info(self, episode: str) -> dict[str, dict[str, Any]]:
+        text = self.demo(episode).attrs.get("camera_info")
+        return json.loads(text) if text else {}
+
+    def model_file(self, episode: str) -> str | None:
+        text = self.demo(episode).attrs.get("model_file")
+        return str(text) if text else None
+
+    def task(self, episode: str) -> str:
+        return str(self.env_args.get("env_name", "unknown"))
+
+    def close(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown()
+        self.file.close()
+
+
+def _feature(dataset: h5py.Dataset) -> Feature:
+    return Feature(tuple(dataset.shape[1:]), str(dataset.dtype), is_image(dataset))
+
+
+def _whole_gzip(dataset: h5py.Dataset) -> bool:
+    """Chunks of whole frames, compressed by gzip and nothing else. (Shuffling single bytes does
+    nothing, but may be there.)"""
+    return bool(
+        dataset.compression == "gzip"
+        and dataset.chunks[1:] == dataset.shape[1:]
+        and not dataset.fletcher32
+        and dataset.scaleoffset is None
+        and dataset.dtype == np.uint8
+    )

@@ -1,0 +1,225 @@
+"""Aligned episodes into robomimic's HDF5 layout, beside what the source had."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from palm_jax.train.data import output
+from palm_jax.train.data.errors import disk_full
+from palm_jax.train.data.robomimic import RobomimicSource, by_number, is_image
+from palm_jax.train.data.source import Source
+
+COMPRESSIONS: dict[str, dict[str, Any]] = {
+    "gzip": {"compression": "gzip", "compression_opts": 1},
+    "lzf": {"compression": "lzf"},
+    "none": {},
+}
+CHECKSUMS = "palm_sha256"
+"""Attribute of an episode: {key: sha256} as JSON."""
+
+RECIPE = "palm"
+"""Attribute of `data`: how the file was made, as JSON."""
+
+_DONE = "palm_complete"
+_HASHED_ROWS = 64
+
+
+def checksum(dataset: h5py.Dataset) -> str:
+    """sha256 of an array, read in blocks."""
+    digest = output.Digest()
+    for first in range(0, len(dataset), _HASHED_ROWS):
+        digest.add(dataset[first : first + _HASHED_ROWS])
+    return digest.hex()
+
+
+def sound(demo: h5py.Group) -> list[str]:
+    """Problems of an episode against its checksums; empty if it has none of either."""
+    expected = json.loads(demo.attrs.get(CHECKSUMS, "{}"))
+    problems = []
+    for key, value in expected.items():
+        if key not in demo:
+            problems.append(f"{key} is missing")
+            continue
+        try:
+            if checksum(demo[key]) != value:
+                problems.append(f"{key} is not what was written (sha256)")
+        except (OSError, RuntimeError) as error:
+            problems.append(f"{key} cannot be read ({error})")
+    return problems
+
+
+class RobomimicWriter(output.Writer):
+    """See `output.Writer`.
+
+    Args:
+      path: of the output.
+      source: what is kept comes from here.
+      recipe: how the output is made, written into the file.
+      keep: "numbers" (all but images), "all" or "none" of the source's arrays.
+      compression: of the aligned images, a key of `COMPRESSIONS`.
+      prefix: of the new keys.
+      instead: write the labels as `actions`, and the source's as `source_actions`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        source: Source,
+        recipe: Mapping[str, Any],
+        *,
+        keep: str,
+        compression: str,
+        prefix: str,
+        instead: bool,
+    ):
+        self.path, self.partial = path, output.partial_path(path)
+        self.source, self.keep, self.prefix = source, keep, prefix
+        self.options = COMPRESSIONS[compression]
+        self.actions = "actions" if instead else f"{prefix}_actions"
+        self._demo: h5py.Group | None = None
+        self.file = self._resume(recipe) or self._start(recipe)
+
+    def _start(self, recipe: Mapping[str, Any]) -> h5py.File:
+        output.remove(self.partial)
+        self.partial.parent.mkdir(parents=True, exist_ok=True)
+        file = h5py.File(self.partial, "w")
+        data = file.create_group("data")
+        if isinstance(self.source, RobomimicSource):
+            for name, value in self.source.data.attrs.items():
+                data.attrs[name] = value
+        else:
+            args = {"env_name": self.source.task(self.source.episodes[0]), "env_kwargs": {}}
+            args["env_kwargs"] = {"control_freq": self.source.fps}
+            data.attrs["env_args"] = json.dumps(args)
+        data.attrs[RECIPE] = json.dumps(recipe)
+        # Room for it now: an attribute that is added last would lie at the end of the file, and
+        # with the end of a cut copy the list of episodes would be lost.
+        data.attrs["total"] = 0
+        file.flush()
+        return file
+
+    def _resume(self, recipe: Mapping[str, Any]) -> h5py.File | None:
+        if not self.partial.exists():
+            return None
+        try:
+            file = h5py.File(self.partial, "r+")
+            data = file["data"]
+            found = json.loads(data.attrs[RECIPE])
+        except (OSError, RuntimeError, KeyError, ValueError):
+            return None  # killed while it was written: begin again
+        try:
+            output.same_recipe(found, recipe, self.partial)
+            done = []
+            for name in sorted(data, key=by_number):
+                if data[name].attrs.get(_DONE) and not sound(data[name]):
+                    done.append(str(data[name].attrs[_DONE]))
+                else:
+                    del data[name]
+        except BaseException:
+            file.close()
+            raise
+        self.done = tuple(done)
+        return file
+
+    def begin(self, name: str, length: int, numbers: Mapping[str, np.ndarray]) -> None:
+        own = name if isinstance(self.source, RobomimicSource) else f"demo_{name}"
+        self._demo = demo = self.file["data"].create_group(own)
+        self._name, self._length, self._filled = name, length, 0
+        self._digests: dict[str, output.Digest] = {}
+        self._keep(demo, name)
+        for key, values in numbers.items():
+            target = self.actions if key == "actions" else f"obs/{self.prefix}_{key}"
+            if key == "actions" and target == "actions" and "actions" in demo:
+                demo.move("actions", "source_actions")
+            demo[target] = values
+            self._digest(target, values)
+        demo.attrs["num_samples"] = length
+
+    def _digest(self, target: str, values: np.ndarray) -> None:
+        self._digests.setdefault(target, output.Digest()).add(values)
+
+    def _keep(self, demo: h5py.Group, name: str) -> None:
+        if isinstance(self.source, RobomimicSource):
+            old = self.source.data[name]
+            for key, value in old.attrs.items():
+                if not key.startswith("palm_"):
+                    demo.attrs[key] = value
+            if self.keep != "none":
+                _copy(old, demo, images=self.keep == "all")
+        elif self.keep != "none":
+            for key in self.source.number_keys:
+                target = "actions" if key == "action" else f"obs/{key.removeprefix('observation.')}"
+                demo[target] = self.source.numbers(name, key)
+
+    def add(self, images: np.ndarray, numbers: Mapping[str, np.ndarray]) -> None:
+        demo = self._demo
+        assert demo is not None
+        rows = slice(self._filled, self._filled + len(images))
+        for key, values in (("image", images), *numbers.items()):
+            target = f"obs/{self.prefix}_{key}"
+            if target not in demo:
+                shape = (self._length, *values.shape[1:])
+                options = self.options if key == "image" else {}
+                chunks = (1, *values.shape[1:]) if options else None
+                demo.create_dataset(target, shape, values.dtype, chunks=chunks, **options)
+            demo[target][rows] = values
+            self._digest(target, values)
+        self._filled = rows.stop
+
+    def end(self) -> None:
+        demo = self._demo
+        assert demo is not None and self._filled == self._length
+        hashes = {key: digest.hex() for key, digest in self._digests.items()}
+        demo.attrs[CHECKSUMS] = json.dumps(hashes)
+        demo.attrs[_DONE] = self._name
+        self.file.flush()
+        self._demo = None
+
+    def stop(self) -> None:
+        if self._demo is not None:
+            del self.file[self._demo.name]
+        self.file.close()
+
+    def discard(self) -> None:
+        try:
+            self.file.close()
+        except (OSError, RuntimeError):
+            pass  # a full disk: HDF5 cannot flush what is thrown away anyway
+        output.remove(self.partial)
+
+    def complete(self) -> None:
+        data = self.file["data"]
+        data.attrs["total"] = sum(int(demo.attrs["num_samples"]) for demo in data.values())
+        if isinstance(self.source, RobomimicSource):
+            copy_masks(self.source.file, self.file, list(data))
+        self.file.close()
+        output.publish(self.partial, self.path)
+
+
+def _copy(old: h5py.Group, new: h5py.Group, *, images: bool) -> None:
+    """Everything of an episode, as it is stored; images only if asked for."""
+    for key, item in old.items():
+        if isinstance(item, h5py.Group):
+            _copy(item, new.require_group(key), images=images)
+        elif images or not is_image(item):
+            old.copy(item, new, name=key)
+
+
+def copy_masks(old: h5py.File, new: h5py.File, episodes: Sequence[str]) -> None:
+    """Robomimic's filter keys, as far as they name episodes that are there."""
+    if "mask" in new:  # an earlier call came as far as this
+        del new["mask"]
+    for key, item in (old.get("mask") or {}).items():
+        names = [name for name in item[()] if name.decode() in episodes]
+        new[f"mask/{key}"] = np.array(names, dtype=item.dtype)
+
+
+def writing(path: Path) -> Any:
+    """Turns a full disk into an error that says what is left: nothing."""
+    return disk_full(path, "nothing half-written is left; make room, or choose another --out")

@@ -1,0 +1,337 @@
+"""Is a data file whole, and can the whole part of one be saved?"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from palm_jax.train.data import output, robomimic_writer, video
+from palm_jax.train.data.calibration import RobotKeys
+from palm_jax.train.data.errors import (
+    DataError,
+    FormatError,
+    OutputError,
+    TruncatedError,
+)
+from palm_jax.train.data.lerobot import LeRobotSource
+from palm_jax.train.data.lerobot_writer import LeRobotWriter
+from palm_jax.train.data.recording import robot_keys
+from palm_jax.train.data.robomimic import RobomimicSource, by_number
+from palm_jax.train.data.source import Source, fingerprint, open_source
+
+Problems = dict[str, list[str]]  # episode, or "" for the file -> what is wrong
+
+_ROWS = 64
+_PER_FRAME = ("actions", "states", "rewards", "dones")
+
+
+def verify(path: Path, *, robot: RobotKeys | None = None) -> Problems:
+    """Reads everything and reports what is wrong; empty if the file is sound.
+
+    Lengths, totals, finite poses and actions, images that can be decoded or counted, and the
+    checksums of what `data align` has written.
+
+    Args:
+      path: file or folder.
+      robot: keys of the pose and the gripper, where they are not known ones.
+
+    Raises:
+      FormatError, TruncatedError: the file cannot even be opened.
+    """
+    with open_source(path) as source:
+        problems: Problems = {}
+        keys = _pose_keys(source, robot or RobotKeys())
+        for name in source.episodes:
+            found = _episode(source, name, keys)
+            if found:
+                problems[name] = found
+        whole = _totals(source)
+        return ({"": whole} if whole else {}) | problems
+
+
+def _pose_keys(source: Source, robot: RobotKeys) -> list[str]:
+    """Expressions whose numbers must be finite."""
+    try:
+        keys = robot_keys(source, robot)
+    except DataError:
+        return []
+    return [key for key in (keys.pose, keys.opening) if key]
+
+
+def _episode(source: Source, name: str, keys: list[str]) -> list[str]:
+    problems: list[str] = []
+    try:
+        length = source.length(name)
+        if length < 2:
+            problems.append(f"{length} frame{'s' * (length != 1)}")
+        actions = [key for key in source.number_keys if key in ("actions", "action")]
+        for key in [*keys, *actions]:
+            values = source.columns(name, key)
+            if len(values) != length:
+                problems.append(f"{key} has {len(values)} rows, expected {length}")
+            bad = np.flatnonzero(~np.isfinite(values).all(1))
+            if len(bad):
+                problems.append(f"{key} has NaN or infinity in {len(bad)} frames from {bad[0]} on")
+        for key in source.image_keys:
+            count = _count(source, name, key)
+            if count != length:
+                problems.append(f"{key} has {count} images, expected {length}")
+        if isinstance(source, RobomimicSource):
+            problems += _hdf5_episode(source, name, length)
+    except (DataError, OSError, RuntimeError, KeyError, ValueError) as error:
+        problems.append(str(error).removeprefix(f"{source.path}: "))
+    return problems
+
+
+def _count(source: Source, name: str, key: str) -> int:
+    """Images of an episode. All are decoded but those in videos, which are counted."""
+    if isinstance(source, LeRobotSource) and source.info["features"][key]["dtype"] == "video":
+        file, start = source.video(name, key)
+        return video.count(file, start, source.fps, source.length(name))
+    return sum(len(block) for block in source.blocks(name, key, _ROWS))
+
+
+def _hdf5_episode(source: RobomimicSource, name: str, length: int) -> list[str]:
+    demo = source.demo(name)
+    problems = []
+    told = demo.attrs.get("num_samples")
+    if told is None or int(told) != length:
+        problems.append(f"num_samples is {told}, expected {length}")
+    for key, dataset in source.datasets(name):
+        if not key.startswith("obs/") and key not in _PER_FRAME:
+            continue
+        if len(dataset) != length:
+            problems.append(f"{key} has {len(dataset)} rows, expected {length}")
+        elif dataset.dtype.kind != "u":
+            source.numbers(name, key)  # raises where it cannot be read
+    return problems + robomimic_writer.sound(demo)
+
+
+def _totals(source: Source) -> list[str]:
+    frames = sum(source.length(name) for name in source.episodes)
+    if isinstance(source, RobomimicSource):
+        total = source.data.attrs.get("total")
+        return [] if total is None or int(total) == frames else [f"total is {total}, not {frames}"]
+    problems = []
+    if isinstance(source, LeRobotSource):
+        expected = {"total_episodes": len(source.episodes), "total_frames": frames}
+        for key, value in expected.items():
+            if source.info.get(key) != value:
+                problems.append(f"meta/info.json: {key} is {source.info.get(key)}, not {value}")
+        ends = 0
+        for name in source.episodes:
+            begin = source.row(name)["dataset_from_index"]
+            if begin != ends:
+                problems.append(f"episode {name} begins at {begin}, expected {ends}")
+            ends = source.row(name)["dataset_to_index"]
+    return problems
+
+
+# -- repair ----------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Repair:
+    """Of `repair`."""
+
+    path: Path
+    kept: tuple[str, ...]
+    dropped: Mapping[str, str]  # episode -> why
+
+
+def repair(path: Path, out: Path, *, robot: RobotKeys | None = None) -> Repair:
+    """Copies the sound episodes of a file into a new one, numbered anew, with totals that are
+    right.
+
+    Works on HDF5 files that end too early: what lies beyond the end is not taken for zeros.
+
+    Args:
+      path: file or folder; never touched.
+      out: the new one.
+      robot: see `verify`.
+
+    Raises:
+      FormatError, TruncatedError: nothing can be read.
+      OutputError: no sound episode; `out` exists.
+      DiskFullError: no space.
+    """
+    output.check_free(out, path)
+    partial = output.partial_path(out)
+    output.remove(partial)
+    with robomimic_writer.writing(out):
+        try:
+            with _opened(path) as source:
+                problems = {
+                    name: found
+                    for name in source.episodes
+                    if (found := _unsound(source, name, robot or RobotKeys()))
+                }
+                kept = [name for name in source.episodes if name not in problems]
+                if not kept:
+                    reasons = "; ".join(f"{n}: {r[0]}" for n, r in list(problems.items())[:3])
+                    raise OutputError(f"{path}: no sound episode to save ({reasons})")
+                note = {"repaired": fingerprint(path, source.files()), "dropped": problems}
+                if isinstance(source, RobomimicSource):
+                    _copy_hdf5(source, kept, partial, note)
+                    output.publish(partial, out)
+                else:
+                    _copy_lerobot(source, kept, out, note)
+        except BaseException:
+            output.remove(partial)
+            raise
+    return Repair(out, tuple(kept), {name: reasons[0] for name, reasons in problems.items()})
+
+
+def _unsound(source: Source, name: str, robot: RobotKeys) -> list[str]:
+    if isinstance(source, _CutSource):
+        lost = source.lost(name)
+        if lost:
+            return [f"{lost} lies beyond the end of the file"]
+    problems = _episode(source, name, _pose_keys(source, robot))
+    # What copying puts right is no reason to drop an episode.
+    return [text for text in problems if not text.startswith("num_samples")]
+
+
+def _opened(path: Path) -> Source:
+    try:
+        return open_source(path)
+    except TruncatedError as error:
+        if path.is_dir():
+            raise
+        found = re.search(r"its header says (\d+)", str(error))
+        if found is None:
+            raise
+        return _CutSource(path, int(found.group(1)))
+
+
+class _Padded(io.RawIOBase):
+    """A file that seems to go on with zeros to a given size."""
+
+    def __init__(self, path: Path, size: int):
+        self._file = path.open("rb")
+        self._size, self._place = size, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self._size}[whence]
+        self._place = base + offset
+        return self._place
+
+    def tell(self) -> int:
+        return self._place
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        wanted = max(0, min(len(view), self._size - self._place))
+        found = os.pread(self._file.fileno(), wanted, self._place)
+        view[: len(found)] = found
+        view[len(found) : wanted] = bytes(wanted - len(found))
+        self._place += wanted
+        return wanted
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+class _CutSource(RobomimicSource):
+    """A robomimic file that ends too early, for as much as there is of it."""
+
+    def __init__(self, path: Path, size: int):
+        self.path, self._pool = path, None
+        self._real = path.stat().st_size
+        self._padded = _Padded(path, size)
+        try:
+            self.file = h5py.File(self._padded, "r")
+            self._read_header()
+        except (OSError, RuntimeError, KeyError, ValueError) as error:
+            self._padded.close()
+            raise TruncatedError(
+                f"{path}: so much is missing ({self._real} of {size} bytes are there) that no "
+                "episode can be read; copy the file again"
+            ) from error
+
+    def lost(self, name: str) -> str:
+        """The first array of an episode that is not all there, or an empty string."""
+        try:
+            for key, dataset in self.datasets(name, every=True):
+                if _end(dataset) > self._real:
+                    return key
+            dict(self.demo(name).attrs)
+        except (DataError, OSError, RuntimeError, KeyError, ValueError):
+            return "part of its structure"
+        return ""
+
+    def length(self, episode: str) -> int:
+        try:
+            return super().length(episode)
+        except (DataError, OSError, RuntimeError, KeyError, ValueError):
+            return 0
+
+    def close(self) -> None:
+        super().close()
+        self._padded.close()
+
+
+def _end(dataset: h5py.Dataset) -> int:
+    """Where in the file the last byte of an array lies."""
+    if dataset.chunks is None:
+        begin = dataset.id.get_offset()
+        return 0 if begin is None else int(begin) + int(dataset.id.get_storage_size())
+    ends = [0]
+    for index in range(dataset.id.get_num_chunks()):
+        info = dataset.id.get_chunk_info(index)
+        ends.append(int(info.byte_offset) + int(info.size))
+    return max(ends)
+
+
+def _copy_hdf5(
+    source: RobomimicSource, kept: list[str], partial: Path, note: dict[str, Any]
+) -> None:
+    with h5py.File(partial, "w") as file:
+        data = file.create_group("data")
+        for key, value in source.data.attrs.items():
+            data.attrs[key] = value
+        data.attrs["palm_repair"] = json.dumps(note)
+        data.attrs["total"] = sum(source.length(name) for name in kept)
+        numbers = {}
+        for index, name in enumerate(sorted(kept, key=by_number)):
+            numbers[name] = f"demo_{index}"
+            source.file.copy(source.data[name], data, name=numbers[name])
+            data[numbers[name]].attrs["num_samples"] = source.length(name)
+        try:
+            _renamed_masks(source.file, file, numbers)
+        except (OSError, RuntimeError, KeyError):
+            pass  # beyond the end: filter keys can be made again
+
+
+def _renamed_masks(old: h5py.File, new: h5py.File, numbers: Mapping[str, str]) -> None:
+    for key, item in (old.get("mask") or {}).items():
+        names = [numbers[n] for raw in item[()] if (n := raw.decode()) in numbers]
+        new[f"mask/{key}"] = np.array(names, dtype="S")
+
+
+def _copy_lerobot(source: Source, kept: list[str], out: Path, note: dict[str, Any]) -> None:
+    if not isinstance(source, LeRobotSource):
+        raise FormatError(f"{source.path}: nothing known to repair")
+    writer = LeRobotWriter(
+        out, source, note, keep="all", encoding="png", prefix="palm", instead=False, episodes=kept
+    )
+    for name in kept:
+        writer.begin(name, source.length(name), {})
+        writer.end()
+    writer.complete()
