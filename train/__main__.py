@@ -11,7 +11,7 @@ from palm_jax._quiet import without_lines
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns 0, or 2 for a command that cannot be run, 130 when interrupted."""
     words = list(sys.argv[1:] if argv is None else argv)
-    if not {"-h", "--help"} & set(words):
+    if not any(word in ("-h", "--help") or word.startswith("--distributed") for word in words):
         print("palm_jax: loading JAX and MuJoCo ...", flush=True)
     warnings.filterwarnings("ignore", message=".*donated buffers were not usable.*")
     with without_lines():  # MJX's complaints about the missing warp back end
@@ -27,7 +27,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     console = terminal.make_console()
     try:
         config = configuration.parse(words)
-    except configuration.ConfigError as error:
+        if config.distributed:
+            devices.connect(config.distributed)
+    except (configuration.ConfigError, devices.DeviceError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     try:

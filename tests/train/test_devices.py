@@ -15,7 +15,8 @@ import jax
 import numpy as np
 import pytest
 
-from palm_jax.train import checkpoint, devices, learner
+from palm_jax.train import __main__ as training
+from palm_jax.train import checkpoint, devices, learner, run
 from palm_jax.train.devices import DeviceError, Split, Together
 
 SCRIPT = Path(__file__).with_name("devices_process.py")
@@ -157,6 +158,20 @@ def test_addresses(text: str, found: tuple[str, int, int] | None) -> None:
 def test_addresses_that_are_none(text: str) -> None:
     with pytest.raises(DeviceError, match="expected auto, or HOST:PORT,COUNT,INDEX.*got"):
         devices.address_of(text)
+
+
+def test_the_command_joins_the_others_before_it_does_anything(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done: list[str] = []
+    monkeypatch.setattr(devices, "connect", lambda text: done.append(f"connect {text}"))
+    monkeypatch.setattr(run, "execute", lambda config, console: done.append("execute"))
+    assert training.main(["--distributed", "node0:1,2,1"]) == 0
+    assert done == ["connect node0:1,2,1", "execute"]
+    assert capsys.readouterr().out == ""  # what all processes say is said by one
+    monkeypatch.undo()
+    assert training.main(["--distributed", "node0:1,2"]) == 2
+    assert "expected auto, or HOST:PORT,COUNT,INDEX" in capsys.readouterr().err
 
 
 def test_processes_of_one_machine_do_not_listen_to_the_network() -> None:
