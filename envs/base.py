@@ -102,6 +102,11 @@ def _centroid(mask: jax.Array) -> tuple[jax.Array, jax.Array]:
     return uv / jnp.maximum(count, 1.0), count
 
 
+def _own_device() -> jax.Device:
+    """MJX's default is the first of all processes' devices, which another process may own."""
+    return jax.local_devices()[0]
+
+
 class Env:
     """A task on a robot.
 
@@ -125,7 +130,7 @@ class Env:
         spec = build_spec(robot, task.asset, task.contacts(robot))
         self.mj_model: mujoco.MjModel = spec.compile()
         self.xml: str = spec.to_xml()
-        self.mjx_model = mjx.put_model(self.mj_model)
+        self.mjx_model = mjx.put_model(self.mj_model, device=_own_device())
         self.scene_model = SceneModel(self.mj_model)
         self.chain = control.arm_chain(self.mj_model, robot)
         self._distractors = Distractors(self.mj_model)
@@ -211,7 +216,7 @@ class Env:
             self._ids, jax.random.fold_in(key, _LAYOUT_DRAW), self._home_qpos(), xy, yaw, area
         )
         parked = self._distractors.parked()
-        data = mjx.make_data(self.mjx_model).replace(
+        data = mjx.make_data(self.mjx_model, device=_own_device()).replace(
             qpos=placement.qpos,
             ctrl=self._servo_targets(jnp.asarray(self.chain.home), jnp.ones(())),
             mocap_pos=jnp.concatenate([parked.pos, placement.mocap_pos]),

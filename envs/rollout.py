@@ -6,13 +6,14 @@ jits, each with the compiler options it wants: the fast way on CPUs. `scan_episo
 episodes up to rounding.
 """
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import AxisType, PartitionSpec
 
 from palm_jax.align import Aligned, AlignSpec, Camera
 from palm_jax.envs import physics
@@ -113,14 +114,52 @@ def _full_frame(env: Env, state: State, params: EnvParams, *, size: int) -> jax.
     return rgb
 
 
+def batched_over(
+    devices: Sequence[jax.Device], worlds: int
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """`jax.vmap`, or with several devices one that gives each an equal part of `worlds` examples.
+
+    Raises:
+      ValueError: the devices do not divide the worlds.
+    """
+    if len(devices) < 2:
+        return jax.vmap
+    if worlds % len(devices):
+        raise ValueError(
+            f"{worlds} worlds cannot be split over {len(devices)} devices: pass a multiple of "
+            f"{len(devices)} worlds, or fewer devices"
+        )
+    axes = (AxisType.Auto,)
+    mesh = jax.make_mesh((len(devices),), ("worlds",), axis_types=axes, devices=devices)
+    spec = PartitionSpec("worlds")
+
+    def batched(function: Callable[..., Any]) -> Callable[..., Any]:
+        # The check would ask of every loop in the physics that its state vary over the axis.
+        return jax.shard_map(
+            jax.vmap(function), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
+        )
+
+    return batched
+
+
 class Runner:
     """The compiled pieces of an environment for a fixed number of worlds.
 
     Every function is batched over [W] worlds: keys [W], states and params with a leading [W]. One
     `Runner` compiles once and serves demonstrations, selection and evaluation alike.
+
+    With several `devices` each of them has an equal part of the worlds, which never need each
+    other: nothing is sent between devices while an episode runs.
     """
 
-    def __init__(self, env: Env, worlds: int) -> None:
+    def __init__(
+        self, env: Env, worlds: int, *, devices: Sequence[jax.Device] | None = None
+    ) -> None:
+        """`devices`: of this process; the default one by default.
+
+        Raises:
+          ValueError: too many worlds for a CPU, or not the same number for every device.
+        """
         limit = physics.MAX_CPU_WORLDS
         if not 0 < worlds <= limit and jax.default_backend() == "cpu":
             raise ValueError(
@@ -128,18 +167,25 @@ class Runner:
             )
         self.env = env
         self.worlds = worlds
-        self._act = physics.jit_physics(jax.vmap(env.act))
-        self._jump = physics.jit_physics(jax.vmap(_jump_if_asked(env)))
-        self.expert = physics.jit_physics(jax.vmap(env.expert))
-        self._place = physics.jit_physics(jax.vmap(env.place))
-        self._locate = jax.jit(physics.traced_quickly(jax.vmap(env.locate)))
-        self.restore = physics.jit_physics(jax.vmap(env.restore))
-        self._reposition = physics.jit_physics(jax.vmap(env.reposition))
+        self._devices = tuple(devices or ())
+        self._batched = batched_over(self._devices, worlds)
+        self._act = physics.jit_physics(self._batched(env.act))
+        self._jump = physics.jit_physics(self._batched(_jump_if_asked(env)))
+        self.expert = physics.jit_physics(self._batched(env.expert))
+        self._place = physics.jit_physics(self._batched(env.place))
+        self._locate = jax.jit(physics.traced_quickly(self._batched(env.locate)))
+        self.restore = physics.jit_physics(self._batched(env.restore))
+        self._reposition = physics.jit_physics(self._batched(env.reposition))
         self._views: dict[Hashable, Callable[..., Any]] = {}
 
     def halved(self) -> "Runner":
-        """The same environment for half as many worlds (at least one): compiled anew."""
-        return Runner(self.env, max(self.worlds // 2, 1))
+        """The same environment for half as many worlds (at least one): compiled anew.
+
+        With several devices, half of the worlds of each, or one device if they do not divide them.
+        """
+        worlds = max(self.worlds // 2, 1)
+        shared = len(self._devices) > 0 and worlds % len(self._devices) == 0
+        return Runner(self.env, worlds, devices=self._devices if shared else None)
 
     def reset(self, keys: jax.Array, params: EnvParams) -> State:
         """`Env.reset` of W worlds, in three compiled pieces.
@@ -194,7 +240,7 @@ class Runner:
     def _view(self, name: Hashable, function: Callable[..., Any]) -> Callable[..., Any]:
         """`function` (state, params) of W worlds; whatever has the same name is compiled once."""
         if name not in self._views:
-            self._views[name] = jax.jit(jax.vmap(function))
+            self._views[name] = jax.jit(self._batched(function))
         return self._views[name]
 
     def run(

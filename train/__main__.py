@@ -1,6 +1,7 @@
 """`python -m palm_jax.train`: demonstrations, training, evaluation and report in one command."""
 
 import sys
+import traceback
 import warnings
 from collections.abc import Sequence
 
@@ -10,14 +11,14 @@ from palm_jax._quiet import without_lines
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns 0, or 2 for a command that cannot be run, 130 when interrupted."""
     words = list(sys.argv[1:] if argv is None else argv)
-    if not {"-h", "--help"} & set(words):
+    if not any(word in ("-h", "--help") or word.startswith("--distributed") for word in words):
         print("palm_jax: loading JAX and MuJoCo ...", flush=True)
     warnings.filterwarnings("ignore", message=".*donated buffers were not usable.*")
     with without_lines():  # MJX's complaints about the missing warp back end
         from palm_jax.envs.rollout import StartPoseError
         from palm_jax.train import config as configuration
         from palm_jax.train import console as terminal
-        from palm_jax.train import interrupts, run
+        from palm_jax.train import devices, interrupts, run
         from palm_jax.train.demos import DemoFileError
         from palm_jax.train.learner import NonFiniteError
         from palm_jax.train.locks import Busy
@@ -26,21 +27,33 @@ def main(argv: Sequence[str] | None = None) -> int:
     console = terminal.make_console()
     try:
         config = configuration.parse(words)
-    except configuration.ConfigError as error:
+        if config.distributed:
+            devices.connect(config.distributed)
+    except (configuration.ConfigError, devices.DeviceError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     try:
         with interrupts.raising():
             run.execute(config, console)
-    except (configuration.ConfigError, DemoFileError, StartPoseError, RecordError, Busy) as error:
+    except (
+        configuration.ConfigError, devices.DeviceError, DemoFileError, StartPoseError, RecordError,
+        Busy,
+    ) as error:  # fmt: skip
         print(f"error: {error}", file=sys.stderr)
-        return 2
+        return devices.leave(2)
     except (NonFiniteError, MemoryError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        terminal.interrupted(console, run.resume_command(config))
-        return 130
+        return devices.leave(1)
+    except KeyboardInterrupt as stop:
+        if devices.is_first():
+            terminal.interrupted(console, run.resume_command(config))
+        # What all processes agreed on ends all of them in order.
+        return 130 if isinstance(stop, run.Interrupted) else devices.leave(130)
+    except Exception:
+        if devices.alone():
+            raise
+        traceback.print_exc()
+        return devices.leave(1)
     return 0
 
 

@@ -19,6 +19,7 @@ No pickle is written or read. A tree is stored as its leaves by name ("params/he
 that a checkpoint depends on no class of Flax or Optax; the target of `load` gives the structure.
 """
 
+import contextlib
 import hashlib
 import importlib.metadata
 import json
@@ -27,13 +28,14 @@ import math
 import os
 import platform
 import shutil
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as orbax
 from orbax.checkpoint import v1 as ocp
 
 from palm_jax.train.metrics import fsync_folder, plain, write_atomic
@@ -174,12 +176,39 @@ def _write_arrays(path: Path, named: Mapping[str, Any]) -> None:
     # Orbax refuses arrays without elements; the manifest's shape and dtype say all about them.
     tree = nested({name: array for name, array in host.items() if array.size})
     try:
-        ocp.save(path, tree)
+        _orbax_save(path, tree)
     except OSError:
         raise
     except Exception as error:  # a full disk is a ValueError to Orbax, with a page of context
         cause = str(error).rpartition(": ")[2]
         raise OSError(f"{path.parent.parent}: the checkpoint cannot be written: {cause}") from error
+
+
+def _orbax_save(path: Path, tree: Mapping[str, Any]) -> None:
+    if jax.process_count() == 1:
+        ocp.save(path, tree)
+        return
+    # Parameters are the same in every process, and one of them writes; but ocp.save (0.12.8) would
+    # wait for the others all the same. The older interface does what its options say.
+    options = orbax.options.MultiprocessingOptions(**_alone())
+    handler = orbax.PyTreeCheckpointHandler(multiprocessing_options=options)
+    with orbax.Checkpointer(handler, multiprocessing_options=options) as checkpointer:
+        checkpointer.save(path, tree)
+
+
+def _alone() -> dict[str, Any]:
+    """Orbax's words for: this process, without the others."""
+    return {"primary_host": jax.process_index(), "active_processes": {jax.process_index()}}
+
+
+def _reading() -> contextlib.AbstractContextManager[Any]:
+    """Lets Orbax read in this process without the others."""
+    if jax.process_count() == 1:
+        return contextlib.nullcontext()
+    context = ocp.Context()
+    for name, value in _alone().items():
+        setattr(context.multiprocessing, name, value)
+    return context
 
 
 def _hash_files(folder: Path) -> dict[str, dict[str, Any]]:
@@ -236,6 +265,7 @@ def verify(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     manifest = _read_manifest(path)
+    _refuse_ways_out(path, manifest["files"])
     for name, expected in manifest["files"].items():
         file = path / name
         if not file.is_file():
@@ -251,7 +281,21 @@ def verify(path: str | Path) -> dict[str, Any]:
     return manifest
 
 
+def _refuse_ways_out(path: Path, names: Iterable[str]) -> None:
+    """Whoever made the files, reading a checkpoint reads its own folder and nothing else."""
+    for name in names:
+        parts = PurePosixPath(name).parts
+        if not parts or name.startswith("/") or ".." in parts:
+            raise DamagedCheckpoint(path, "way-out", f"{MANIFEST} names {name!r}, a file elsewhere")
+    for folder, folders, files in os.walk(path):
+        for link in (Path(folder, name) for name in folders + files):
+            if link.is_symlink():
+                raise DamagedCheckpoint(path, "link", f"{link.relative_to(path)} is a link")
+
+
 def _read_manifest(path: Path) -> dict[str, Any]:
+    if path.is_symlink() or (path / MANIFEST).is_symlink():
+        raise DamagedCheckpoint(path, "link", "expected a folder and files, not links")
     if not path.is_dir():
         raise DamagedCheckpoint(path, "not-a-folder", "expected a folder")
     if not any(path.iterdir()):
@@ -418,9 +462,11 @@ def _compare(path: Path, saved: Mapping[str, Any], wanted: Mapping[str, Any]) ->
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     """All leaves as host arrays, whatever devices they were saved from."""
     path = path.absolute()
-    metadata = ocp.metadata(path).metadata
-    like = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), metadata)
-    return {name: np.asarray(leaf) for name, leaf in _named_leaves(ocp.load(path, like)).items()}
+    with _reading():
+        metadata = ocp.metadata(path).metadata
+        like = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), metadata)
+        found = ocp.load(path, like)
+    return {name: np.asarray(leaf) for name, leaf in _named_leaves(found).items()}
 
 
 def _restore(value: np.ndarray, like: Any) -> Any:
@@ -441,6 +487,12 @@ def read_meta(path: str | Path) -> dict[str, Any]:
       DamagedCheckpoint: the manifest is missing or damaged.
     """
     return _read_manifest(Path(path))["meta"]
+
+
+def content_hash(path: str | Path) -> str:
+    """SHA-256 of what a checkpoint holds: equal for copies, whatever their meta data say."""
+    manifest = _read_manifest(Path(path))
+    return _digest({name: manifest[name] for name in ("step", "files", "leaves")})
 
 
 def update_meta(path: str | Path, **values: Any) -> None:

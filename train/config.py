@@ -60,6 +60,7 @@ class Config:
       domains: evaluation domains: in_domain, and shifts joined by +.
       videos: episodes filmed for each outcome (success, failure) and method.
       sweep: draw the success heatmaps and camera-angle curves after training.
+      distributed: train in several processes: auto, or HOST:PORT,COUNT,INDEX (docs/scaling.md).
     """
 
     task: str = "lift_lid"
@@ -98,6 +99,7 @@ class Config:
     domains: tuple[str, ...] = DOMAINS
     videos: int = 1
     sweep: bool = True
+    distributed: str = ""
 
     @property
     def second_robot(self) -> str:

@@ -231,6 +231,7 @@ def load(path: Path, *, task: str, robot: str, count: int | None = None) -> Demo
     """
     try:
         with h5py.File(path, "r") as file:
+            _refuse_ways_out(file, path)
             return _read(file["data"], path, task, robot, count)
     except DemoFileError:
         raise
@@ -238,6 +239,22 @@ def load(path: Path, *, task: str, robot: str, count: int | None = None) -> Demo
         raise DemoFileError(
             f"{path} is not a whole demonstration file ({error}); move it away and collect again"
         ) from error
+
+
+def _refuse_ways_out(file: h5py.File, path: Path) -> None:
+    """HDF5 can refer to other files, by links and as storage of its arrays: ours never do."""
+
+    def look(name: str, link: Any) -> str | None:
+        if not isinstance(link, h5py.HardLink):
+            return f"{name} is a link; expected the data themselves"
+        found = file[name]
+        if isinstance(found, h5py.Dataset) and (found.external or found.is_virtual):
+            return f"{name} lies in another file; expected it in this one"
+        return None
+
+    # The first that is wrong ends the visit; h5py passes no exception on.
+    if wrong := file.visititems_links(look):
+        raise DemoFileError(f"{path}: {wrong}")
 
 
 def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None) -> Demos:

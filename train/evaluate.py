@@ -11,6 +11,7 @@ from palm_jax.envs import registry, shifts
 from palm_jax.envs.base import EnvParams, State
 from palm_jax.envs.rollout import Act, Episodes, Runner, take_params
 from palm_jax.envs.tasks import Task
+from palm_jax.train import devices
 from palm_jax.train.learner import NOISE_ROWS, Learner, PolicyState
 from palm_jax.train.methods import Method
 from palm_jax.train.records import DomainRecord
@@ -53,8 +54,14 @@ class Runners:
         *,
         tell: Callable[[str], None] | None = None,
     ) -> "Runners":
-        """The runners of a task and two robots by name, `worlds` worlds a batch."""
-        return cls(lambda name: Runner(registry.make(task, name), worlds), robot, other, tell=tell)
+        """The runners of a task and two robots by name, `worlds` worlds a batch, which this
+        process's devices share."""
+        found = devices.local_for(worlds)
+
+        def make(name: str) -> Runner:
+            return Runner(registry.make(task, name), worlds, devices=found)
+
+        return cls(make, robot, other, tell=tell)
 
     def of_robot(self, robot: str) -> Runner:
         """The one of a robot."""

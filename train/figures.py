@@ -61,6 +61,7 @@ _RC: Any = {
     "grid.color": FAINT,
     "grid.linewidth": 0.6,
     "text.color": INK,
+    "text.parse_math": False,  # names come from files: a dollar sign is one
     "xtick.color": MUTED,
     "ytick.color": MUTED,
     "xtick.labelsize": 8,

@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike
 
 from palm_jax import align
 from palm_jax.train import model
+from palm_jax.train.devices import Split
 
 ACTION_DIM = 10  # 6D rotation, xyz, gripper
 ROTATION = slice(0, 6)
@@ -512,6 +513,12 @@ class Learner:
         """`step`, compiled; it consumes the state that it is given."""
         return jax.jit(self.step, donate_argnums=1, compiler_options=compiler_options())
 
+    def step_over(self, split: Split) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
+        """`jitted_step` for the devices that share it."""
+        if split.mesh is None:
+            return self.jitted_step
+        return split.compiled(self.step, donate_argnums=1, compiler_options=compiler_options())
+
     @functools.cached_property
     def jitted_act(self) -> Callable[..., jax.Array]:
         """`act`, compiled once per batch size."""
@@ -760,6 +767,7 @@ def run(
     checkpoint_every: int = 0,
     on_checkpoint: Callable[[int, TrainState], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
+    devices: Sequence[jax.Device] | None = None,
     on_failure: Callable[[Failure], None] | None = None,
 ) -> TrainState:
     """Train up to `steps`, and return the state.
@@ -778,13 +786,19 @@ def run(
         after the last one unless it was just called. The state must not be kept: it is consumed
         by the next step.
       should_stop: asked before every step; True ends the run as if `steps` were reached here.
+      devices: those that share every batch, the default device alone by default. With those of
+        several processes each of them makes this call, with the same arguments; `state` and
+        `bank` count on the first only. States that are handed out are on one device.
       on_failure: given a step to look at, before `NonFiniteError` is raised.
 
     Raises:
+      DeviceError: the devices do not divide the batch.
       NonFiniteError: more than `config.max_skipped_steps` updates had to be skipped.
       ValueError: the data do not fit the learner.
     """
     config = learner.config
+    split = Split(None) if devices is None else Split.over(devices)
+    split.check(config.batch_size)
     count = check_batch(data, learner.proprio_dim, learner.views, config.crop)
     for name in ("proprio", "actions"):
         if not np.isfinite(getattr(data, name)).all():
@@ -802,22 +816,26 @@ def run(
         state = learner.jitted_init(keys.init, normalizer, trunk=trunk)
     backgrounds = None if bank is None or config.overlay_fraction == 0 else jnp.asarray(bank)
     last = config.steps if steps is None else steps
+    key, state, backgrounds = split.everywhere((keys.step, state, backgrounds))
+    step = learner.step_over(split)
     done = saved = int(state.step)
     while done < last and not (should_stop and should_stop()):
-        batch = take(data, batch_indices(keys.order, done, count, config.batch_size))
-        state, metrics = learner.jitted_step(keys.step, state, batch, backgrounds)
+        batch = split.rows(data, batch_indices(keys.order, done, count, config.batch_size))
+        state, metrics = step(key, state, batch, backgrounds)
         done += 1
         if done % log_every == 0 or done == last:
             numbers = {name: float(value) for name, value in metrics.items()}
             if on_log:
                 on_log(done, numbers)
             if on_failure and int(numbers["skipped"]) > config.max_skipped_steps:
-                on_failure(_find_failure(learner, keys, state, data, backgrounds, log_every))
+                alone = split.on_one(state), split.on_one(backgrounds)
+                on_failure(_find_failure(learner, keys, alone[0], data, alone[1], log_every))
             check_skipped(int(numbers["skipped"]), done, config)
         if on_checkpoint and checkpoint_every and done % checkpoint_every == 0:
-            on_checkpoint(done, state)
+            on_checkpoint(done, split.on_one(state))
             saved = done
     check_skipped(int(state.skipped), done, config)
+    state = split.on_one(state)
     if on_checkpoint and checkpoint_every and saved != done:
         on_checkpoint(done, state)
     return state

@@ -6,6 +6,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".webp"}
+_FORMATS = ("PNG", "JPEG", "BMP", "WEBP")
 
 
 def read_folder(folder: Path, size: int, *, most: int = 512) -> np.ndarray:
@@ -20,8 +21,9 @@ def read_folder(folder: Path, size: int, *, most: int = 512) -> np.ndarray:
     pictures = []
     for file in files:
         try:
-            with Image.open(file) as picture:
+            # Named, because Pillow starts Ghostscript for a file that is PostScript inside.
+            with Image.open(file, formats=_FORMATS) as picture:
                 pictures.append(np.asarray(picture.convert("RGB").resize((size, size))))
-        except (UnidentifiedImageError, OSError) as error:
+        except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
             raise ValueError(f"{file} cannot be read as a picture: {error}") from error
     return np.stack(pictures)

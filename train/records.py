@@ -13,6 +13,7 @@ names the file and the problem.
 
 import io
 import json
+import re
 import struct
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -190,6 +191,11 @@ def sweep_path(folder: Path, robot: str = "", *, shift: str = "") -> Path:
     return folder / f"{stem}{f'-{robot}' if robot else ''}.npz"
 
 
+def file_word(name: str) -> str:
+    """A name that comes from a file, as part of a file's name: it leads into no other folder."""
+    return re.sub(r"[^\w+-]+", "-", name)[:80]
+
+
 def swept_robot(path: Path) -> str:
     """The robot in a sweep's file name, "" for the trained one: the reverse of `sweep_path`."""
     words = path.stem.split("-")
@@ -215,10 +221,11 @@ def load_strengths(path: Path) -> StrengthSweep:
             f"{path}: expected success and nan of shape [{len(strengths)}, S], "
             f"got {success.shape} and {nan.shape}"
         )
-    return StrengthSweep(str(arrays["shift"]), strengths, success, nan, _worlds(arrays))
+    return StrengthSweep(str(arrays["shift"]), strengths, success, nan, worlds_of(arrays))
 
 
-def _worlds(arrays: Mapping[str, NDArray[Any]]) -> int:
+def worlds_of(arrays: Mapping[str, NDArray[Any]]) -> int:
+    """Worlds in a batch at the end of a sweep, 0 if they were not recorded."""
     found = arrays.get("worlds", np.zeros((), int))
     return int(found) if found.shape == () and found.dtype.kind in "iu" else 0
 
@@ -282,7 +289,7 @@ def load_sweep(path: Path) -> Sweep:
                 f"{path}: {name}: expected shape [angles, xs, ys, episodes] = {grid} + (S,), "
                 f"got {array.shape}"
             )
-    return Sweep(angles, xs, ys, success, nan, _worlds(arrays))
+    return Sweep(angles, xs, ys, success, nan, worlds_of(arrays))
 
 
 def load_json(path: Path) -> dict[str, Any]:

@@ -391,7 +391,16 @@ def _media(path: Path, runs: Sequence[Run]) -> tuple[list[Path], list[Path]]:
         if file.suffix.lower() in (".mp4", ".gif") and not file.name.startswith(".")
     }
     pictures = sorted((path / "figures").glob("*.png"))
-    return [p for p in pictures if not p.name.startswith(".")], list(videos.values())
+    inside = [path.resolve(), *(run.path.resolve() for run in runs)]
+    return (
+        [p for p in pictures if not p.name.startswith(".") and _within(p.resolve(), inside)],
+        [shown for file, shown in videos.items() if _within(file, inside)],
+    )
+
+
+def _within(file: Path, folders: Sequence[Path]) -> bool:
+    """Whether a file lies there: a page is passed on, and must not carry what a link points at."""
+    return any(file.is_relative_to(folder) for folder in folders)
 
 
 def clip_name(stem: str) -> tuple[str, str, str]:
@@ -464,7 +473,9 @@ def build(path: Path, *, max_megabytes: float = 40.0) -> str:
     drawn: list[Path] = []
     tables, plots = [], []
     for task, methods in tasks.items():
-        made = draw(methods, path / "figures", f"{task}-" if len(tasks) > 1 else "")
+        made = draw(
+            methods, path / "figures", f"{records.file_word(task)}-" if len(tasks) > 1 else ""
+        )
         drawn += [file for file, _ in made]
         plots.append("".join(picture(file, caption) for file, caption in made))
         tables.append(_tables(methods))

@@ -19,6 +19,7 @@ from palm_jax.train import (
     checkpoint,
     debug,
     demos,
+    devices,
     figures,
     films,
     interrupts,
@@ -41,6 +42,8 @@ from palm_jax.train.metrics import MetricsLog, write_json
 _FILMED = ("workspace+viewpoint", "workspace+viewpoint+embodiment")
 """Domains of which videos are made, where they are evaluated."""
 
+_PROMISE = "Stopping after this update, which saves; once more ends at once."
+_LOG_EVERY = 25  # updates
 _BANK = 128  # background textures for Random Overlay
 _TRANSFORM_KEY = 1 << 20  # apart from the keys of the demonstrations
 _SELECTION_SEED = 500  # scenes that score checkpoints: never those of the evaluation
@@ -53,8 +56,11 @@ class Interrupted(KeyboardInterrupt):
 def execute(config: Config, console: Console) -> Path:
     """Runs a whole command; returns its folder.
 
+    Of several processes the first does all of it, and the others take part in the training alone.
+
     Raises:
       ConfigError: the folder holds another run.
+      DeviceError: the devices do not divide the batch.
       DemoFileError: the demonstrations cannot be used.
       StartPoseError: a domain asks for start poses that an arm cannot take.
       RecordError: a file of the folder is damaged.
@@ -62,8 +68,13 @@ def execute(config: Config, console: Console) -> Path:
       Interrupted: stopped on request.
     """
     out = config.out or default_out(config)
+    config = dataclasses.replace(config, out=out)
+    devices.Split.over(jax.devices()).check(config.batch_size)
+    if not devices.is_first():
+        _take_part(config)
+        return out
     with locks.claim(out):
-        return _execute(dataclasses.replace(config, out=out), out, console)
+        return _execute(config, out, console)
 
 
 def _execute(config: Config, out: Path, console: Console) -> Path:
@@ -79,7 +90,7 @@ def _execute(config: Config, out: Path, console: Console) -> Path:
             "methods": ", ".join(config.method),
             "preset": config.preset,
             "robot": _robots(config),
-            "device": jax.devices()[0],
+            "device": devices.described(),
             "folder": out,
         },
     )
@@ -95,6 +106,7 @@ def _execute(config: Config, out: Path, console: Console) -> Path:
         name: workspace.make_evaluator(config, methods.find(name), runners) for name in folders
     }
     data = _demonstrations(config, runners.first, console)
+    devices.wait()  # the others read what is written now
     for name, folder in folders.items():
         began = time.monotonic()
         _one_method(config, evaluators[name], data, folder, console)
@@ -108,9 +120,47 @@ def _execute(config: Config, out: Path, console: Console) -> Path:
         write_json(out / "summary.json", counts)
     terminal.results(console, counts)
     console.print(
-        f"Report: {out / 'report.html'}   ({terminal.duration(time.monotonic() - start)})"
+        f"Report: {out / 'report.html'}   ({terminal.duration(time.monotonic() - start)})",
+        markup=False,
     )
+    devices.wait()
     return out
+
+
+def _take_part(config: Config) -> None:
+    """What every process but the first does: its share of every update. It writes nothing, and
+    waits wherever the first one writes or evaluates (`devices.wait`, in the same order there)."""
+    runners = Runners.of(config.task, config.robot, config.second_robot, _worlds(config))
+    devices.wait()
+    data = demos.load(
+        _demonstration_file(config), task=config.task, robot=config.robot, count=config.demos
+    )
+    for name in config.method:
+        if devices.from_first(False):
+            continue
+        evaluator = workspace.make_evaluator(config, methods.find(name), runners)
+        _share_training(config, evaluator, _samples(config, evaluator, data))
+    devices.wait()
+
+
+def _share_training(config: Config, evaluator: Evaluator, data: learner.Batch) -> None:
+    stop = interrupts.Stop(_PROMISE)
+    together = devices.Together(stop)
+    with stop.listening():
+        learner.run(
+            evaluator.learner,
+            data,
+            seed=config.seed,
+            bank=_backgrounds(config) if evaluator.method.augment else None,
+            log_every=_LOG_EVERY,
+            checkpoint_every=config.checkpoint_every,
+            on_checkpoint=lambda step, state: devices.wait(),
+            should_stop=together,
+            on_failure=lambda failure: devices.wait(),
+            devices=jax.devices(),
+        )
+    if together.agreed:
+        raise Interrupted
 
 
 def _robots(config: Config) -> str:
@@ -142,9 +192,13 @@ def _noted(path: Path) -> dict[str, Any]:
         return {}
 
 
-def _demonstrations(config: Config, runner: Runner, console: Console) -> demos.Demos:
+def _demonstration_file(config: Config) -> Path:
     assert config.out is not None
-    path = config.data or config.out / "demos" / f"{config.task}-{config.robot}.hdf5"
+    return config.data or config.out / "demos" / f"{config.task}-{config.robot}.hdf5"
+
+
+def _demonstrations(config: Config, runner: Runner, console: Console) -> demos.Demos:
+    path = _demonstration_file(config)
 
     def waiting() -> None:
         console.print(f"Waiting for another process that makes {path}")
@@ -187,9 +241,17 @@ def _one_method(
     console: Console,
 ) -> None:
     method = evaluator.method
-    if _finished(folder, console):
+    if devices.from_first(_finished(folder, console)):
         console.print(f"{method.name}: trained and evaluated already")
         return
+    _train(config, evaluator, _samples(config, evaluator, data), folder, console)
+    with _timed(folder, "evaluation_s"):
+        _evaluate(config, evaluator, folder, console)
+
+
+def _samples(config: Config, evaluator: Evaluator, data: demos.Demos) -> learner.Batch:
+    """The demonstrations as the method sees them."""
+    method = evaluator.method
     spec, runner = method.spec(evaluator.task, config.image_size), evaluator.runner
     images, proprio, cameras = demos.render_observations(runner, data, spec, frame=method.frame)
     batch = learner.Batch(
@@ -199,9 +261,7 @@ def _one_method(
     for index, transform in enumerate(method.transforms):
         key = jax.random.fold_in(jax.random.key(config.demo_seed), _TRANSFORM_KEY + index)
         batch = transform(key, source, batch)
-    _train(config, evaluator, batch, folder, console)
-    with _timed(folder, "evaluation_s"):
-        _evaluate(config, evaluator, folder, console)
+    return batch
 
 
 def _finished(folder: Path, console: Console) -> bool:
@@ -251,7 +311,8 @@ def _train(
         _score_if_missing(config, evaluator, path, done, state)
     bank = _backgrounds(config) if evaluator.method.augment else None
     dumped = debug.dumping(folder / debug.DUMPS, model)
-    stop = interrupts.Stop("Stopping after this update, which saves; once more ends at once.")
+    stop = interrupts.Stop(_PROMISE)
+    together = devices.Together(stop)
     with (
         MetricsLog(folder / "metrics.jsonl", resume_step=done) as log,
         terminal.ProgressBar(
@@ -274,27 +335,32 @@ def _train(
                 checkpoint.FINGERPRINT: belongs,
             }
             path = checkpoint.save(store, step, state, meta, keep=config.keep)
-            if stop():
-                return
-            score = _score_if_missing(config, evaluator, path, step, state)
-            if score is not None:
-                log.write(step, {"in_domain_success": score})
+            if not stop():
+                score = _score_if_missing(config, evaluator, path, step, state)
+                if score is not None:
+                    log.write(step, {"in_domain_success": score})
+            devices.wait()
 
-        with _timed(folder, "training_and_selection_s"), dumped as on_failure:
+        def on_failure(failure: learner.Failure) -> None:
+            dump(failure)
+            devices.wait()
+
+        with _timed(folder, "training_and_selection_s"), dumped as dump:
             learner.run(
                 model,
                 data,
                 seed=config.seed,
                 state=state,
                 bank=bank,
-                log_every=25,
+                log_every=_LOG_EVERY,
                 on_log=on_log,
                 checkpoint_every=config.checkpoint_every,
                 on_checkpoint=on_checkpoint,
-                should_stop=stop,
+                should_stop=together,
                 on_failure=on_failure,
+                devices=jax.devices(),
             )
-    if stop():
+    if together.agreed:
         raise Interrupted
 
 

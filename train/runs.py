@@ -11,7 +11,7 @@ from palm_jax.train import grids, paper, records
 Counts = dict[str, dict[str, int]]  # domain -> successes, episodes, nan
 
 # Folders of a run that hold no runs themselves.
-_NOT_RUNS = {"checkpoints", "figures", "videos", "damaged"}
+_NOT_RUNS = {"checkpoints", "figures", "videos", "damaged", "shards"}
 
 
 @dataclass

@@ -25,8 +25,17 @@ from rich.console import Console
 from palm_jax.envs import registry, shifts
 from palm_jax.envs.base import EnvParams
 from palm_jax.envs.rollout import Episodes, repeat_params
+from palm_jax.train import (
+    checkpoint,
+    interrupts,
+    locks,
+    records,
+    report,
+    runs,
+    shards,
+    workspace,
+)
 from palm_jax.train import console as terminal
-from palm_jax.train import interrupts, locks, records, report, runs, workspace
 from palm_jax.train.evaluate import Evaluator, Runners
 from palm_jax.train.learner import PolicyState
 
@@ -47,6 +56,9 @@ class SweepConfig:
       seed: of the scenes.
       batch: worlds simulated at once (at most 128 on a CPU).
       redo: sweep again where a sweep is there already.
+      shard: "i/n", the i-th of n machines (from 1): it runs its part of the grid's batches, or of
+        the strengths, into RUN/shards.
+      merge: join the shards of this very command into one sweep; nothing is run.
     """
 
     run: tyro.conf.Positional[Path]
@@ -59,6 +71,8 @@ class SweepConfig:
     seed: int = 2000
     batch: int = 64
     redo: bool = False
+    shard: str = ""
+    merge: bool = False
 
 
 def angles_of(text: str) -> np.ndarray:
@@ -134,6 +148,7 @@ def sweep(
     episodes: int,
     seed: int,
     aligned: bool,
+    only: range | None = None,
     progress: Callable[[int], None] | None = None,
     partial_file: Path | None = None,
 ) -> records.Sweep:
@@ -146,6 +161,7 @@ def sweep(
       episodes: S, in every cell.
       seed: of the scenes.
       aligned: whether the hand's initial yaw turns with the camera.
+      only: rows of the episodes (`Job.part`) to run, all by default; the others stay failures.
       progress: told how many episodes were finished.
       partial_file: where finished episodes are kept meanwhile; those that are there are taken over.
     """
@@ -155,9 +171,9 @@ def sweep(
     cells = cell_params(params, angles, xs, ys, episodes)
     shape = (len(angles), len(xs), len(ys), episodes)
     question = _digest("grid", angles, xs, ys, episodes, seed, aligned, policy)
-    found = _Found(partial_file, question, int(np.prod(shape)), progress)
+    found = _Found(partial_file, question, int(np.prod(shape)), progress, only)
     scenes = jax.random.fold_in(jax.random.key(seed), 0)
-    for rows, part in evaluator.batches(policy, scenes, cells, found.total, first=found.done):
+    for rows, part in evaluator.batches(policy, scenes, cells, found.end, first=found.done):
         found.add(rows, part)
     return records.Sweep(
         angles, xs, ys, found.success.reshape(shape), found.nan.reshape(shape), _worlds(evaluator)
@@ -173,6 +189,7 @@ def sweep_strength(
     episodes: int,
     seed: int,
     aligned: bool,
+    only: range | None = None,
     progress: Callable[[int], None] | None = None,
     partial_file: Path | None = None,
 ) -> records.StrengthSweep:
@@ -186,6 +203,7 @@ def sweep_strength(
       episodes: S, the scenes.
       seed: of the scenes.
       aligned: whether the hand's initial yaw turns with the camera.
+      only: rows of the episodes (`Job.part`) to run, all by default; the others stay failures.
       progress: told how many episodes were finished.
       partial_file: as for `sweep`.
     """
@@ -194,15 +212,15 @@ def sweep_strength(
         params = shifts.aligned_hand(params)
     shape = (len(strengths), episodes)
     question = _digest(shift, strengths, episodes, seed, aligned, policy)
-    found = _Found(partial_file, question, int(np.prod(shape)), progress)
+    found = _Found(partial_file, question, int(np.prod(shape)), progress, only)
     scenes = jax.random.key(seed)
     for row, strength in enumerate(strengths):
         begin = row * episodes
-        first = max(found.done - begin, 0)
-        if first >= episodes:
+        first, last = max(found.done - begin, 0), min(found.end - begin, episodes)
+        if first >= last:
             continue
         there = repeat_params(shifts.shifted(params, shift, strength=float(strength)), episodes)
-        for rows, part in evaluator.batches(policy, scenes, there, episodes, first=first):
+        for rows, part in evaluator.batches(policy, scenes, there, last, first=first):
             found.add(begin + rows, part)
     success, nan = found.success.reshape(shape), found.nan.reshape(shape)
     return records.StrengthSweep(shift, strengths, success, nan, _worlds(evaluator))
@@ -231,9 +249,15 @@ class _Found:
         question: str,
         total: int,
         progress: Callable[[int], None] | None,
+        only: range | None = None,
     ) -> None:
-        """What the file holds of the same `question` is taken over; `progress` is told of it."""
-        self.total, self.done = total, 0
+        """What the file holds of the same `question` is taken over; `progress` is told of it.
+
+        `only`: rows that are asked for, all by default; the others stay failures.
+        """
+        self.total, self.done, self.end = total, 0, total
+        if only is not None:
+            self.done, self.end = only.start, only.stop
         self.success, self.nan = np.zeros((2, total), bool)
         self._path, self._question, self._progress = path, question, progress
         if path is not None and path.exists():
@@ -249,9 +273,11 @@ class _Found:
             return  # damaged: these episodes are run again
         if success.shape != nan.shape or success.ndim != 1 or len(success) > self.total:
             return
+        if not self.done <= len(success) <= self.end:
+            return
+        self._tell(len(success) - self.done)
         self.done = len(success)
         self.success[: self.done], self.nan[: self.done] = success, nan
-        self._tell(self.done)
 
     def add(self, rows: np.ndarray, part: Episodes) -> None:
         """The outcomes of the next rows."""
@@ -278,12 +304,35 @@ class Job(NamedTuple):
     episodes: int  # in all
     run: Callable[..., Any]  # `sweep` or `sweep_strength`, their grids bound
     save: Callable[[Path, Any], Path]
+    record: type[Any]  # what is saved
+    grid: dict[str, Any]  # fields of the record that the command says
+    shape: tuple[int, ...]  # of the outcomes
+    unit: int  # episodes that are not divided among shards
 
-    def perform(self, path: Path, evaluator: Evaluator, policy: PolicyState, **options: Any) -> Any:
-        """Runs it into a file, by way of a partial one beside that; `options`: see `sweep`."""
+    def part(self, shard: tuple[int, int]) -> range:
+        """Rows of a shard (i, n): whole units, as many for each as can be."""
+        units = -(-self.episodes // self.unit)
+        first, last = ((i * units) // shard[1] * self.unit for i in (shard[0] - 1, shard[0]))
+        return range(min(first, self.episodes), min(last, self.episodes))
+
+    def perform(
+        self,
+        path: Path,
+        evaluator: Evaluator,
+        policy: PolicyState,
+        *,
+        save: Callable[[Path, Any], Path] | None = None,
+        **options: Any,
+    ) -> Any:
+        """Runs it into a file, by way of a partial one beside that.
+
+        Args:
+          save: writes the file, if not as usual.
+          options: see `sweep`.
+        """
         kept = path.with_name(f".{path.name}.partial")
         found = self.run(evaluator, policy, partial_file=kept, **options)
-        self.save(path, found)
+        (save or self.save)(path, found)
         kept.unlink(missing_ok=True)
         return found
 
@@ -305,11 +354,21 @@ def job(config: SweepConfig) -> Job:
         run = partial(sweep_strength, shift=config.shift, strengths=strengths, episodes=count)
         # Worlds beyond the scenes of one strength would run for nothing.
         worlds = min(config.batch, count)
-        return Job(worlds, len(strengths) * count, run, records.save_strengths)
+        shape: tuple[int, ...] = (len(strengths), count)
+        line = {"shift": config.shift, "strengths": strengths}
+        return Job(
+            worlds, int(np.prod(shape)), run, records.save_strengths, records.StrengthSweep, line,
+            shape, count,
+        )  # fmt: skip
     angles, (xs, ys) = angles_of(config.camera), cells_of(config.workspace)
     count = config.episodes or 1
     grid = partial(sweep, angles=angles, xs=xs, ys=ys, episodes=count)
-    return Job(config.batch, len(angles) * len(xs) * len(ys) * count, grid, records.save_sweep)
+    shape = (len(angles), len(xs), len(ys), count)
+    axes = {"angles": angles, "xs": xs, "ys": ys}
+    return Job(
+        config.batch, int(np.prod(shape)), grid, records.save_sweep, records.Sweep, axes, shape,
+        config.batch,
+    )  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -325,12 +384,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         console.print("Stopped; the same command goes on with the batch that was running.")
         return 130
+    if config.shard:
+        return 0  # the report is for the one who joins the shards
     return report.main([str(config.run)])
 
 
 def _run(config: SweepConfig, console: Console) -> None:
     """Sweeps every run that the command is about, and writes the files."""
-    asked = job(config)
+    asked, shard = job(config), shards.parse(config.shard) if config.shard else (1, 1)
+    if config.shard and config.merge:
+        raise ValueError("shard, merge: expected one of them; --merge alone joins the shards")
     if config.robot and config.robot not in registry.ROBOTS:
         raise ValueError(f"unknown robot {config.robot!r}; known: {', '.join(registry.ROBOTS)}")
     folders = runs.find_runs(config.run) if config.run.is_dir() else []
@@ -343,8 +406,15 @@ def _run(config: SweepConfig, console: Console) -> None:
         path = records.sweep_path(
             folder, "" if robot == stored.robot else robot, shift=config.shift
         )
-        if path.exists() and not config.redo:
-            console.print(f"{folder}: swept already (--redo to sweep again)")
+        if config.merge:
+            asked.save(path, _merged(config, asked, folder, path))
+            console.print(f"Joined: {path}", markup=False)
+            continue
+        into = shards.path_of(path, *shard) if config.shard else path
+        if into.exists() and not config.redo:
+            if config.shard:
+                shards.check(into, shards.load(into)[1], _header(config, folder))
+            console.print(f"{folder}: swept already (--redo to sweep again)", markup=False)
             continue
         world = stored.task, robot
         if world not in runners:
@@ -356,24 +426,60 @@ def _run(config: SweepConfig, console: Console) -> None:
                 tell=lambda text: console.print(text, style="bold", markup=False),
             )
         try:
-            with locks.claim(folder, name=f".{path.stem}.claim"):
-                _sweep_one(folder, path, asked, config.seed, runners[world], console)
+            with locks.claim(folder, name=f".{into.stem}.claim"):
+                _sweep_one(folder, into, asked, config, runners[world], console)
         except locks.Busy as error:
-            console.print(f"{path} is left to another process: {error}", markup=False)
+            console.print(f"{into} is left to another process: {error}", markup=False)
 
 
 def _sweep_one(
-    folder: Path, path: Path, asked: Job, seed: int, runners: Runners, console: Console
+    folder: Path,
+    path: Path,
+    asked: Job,
+    config: SweepConfig,
+    runners: Runners,
+    console: Console,
 ) -> None:
-    """One policy's file."""
+    """One policy's file, or a shard of it."""
     evaluator, policy = workspace.load_policy(folder, runners)
-    label = f"sweep {evaluator.method.name}"
-    with terminal.ProgressBar(console, asked.episodes, label, unit="episode") as bar:
+    label, options = f"sweep {evaluator.method.name}", dict[str, Any]()
+    only = range(asked.episodes)
+    if config.shard:
+        only, header = asked.part(shards.parse(config.shard)), _header(config, folder)
+        path.parent.mkdir(exist_ok=True)
+        options["save"] = lambda into, found: shards.save(into, vars(found), header)
+    with terminal.ProgressBar(console, len(only), label, unit="episode") as bar:
         asked.perform(
             path,
             evaluator,
             policy,
-            seed=seed,
+            seed=config.seed,
             aligned=workspace.quoted_variant(folder) == "aligned",
+            only=only,
             progress=bar.advance,
+            **options,
         )
+    if config.shard:
+        console.print(f"Shard {config.shard}: {path}", markup=False)
+
+
+def _header(config: SweepConfig, folder: Path) -> dict[str, Any]:
+    """The conditions of a run's sweep in which its shards must agree."""
+    stored = workspace.stored_config(folder)
+    best = checkpoint.best(folder / "checkpoints")
+    return {
+        "task": stored.task,
+        "method": stored.method[0],
+        "robot": config.robot or stored.robot,
+        "episodes": config.episodes,
+        "seed": config.seed,
+        "batch": config.batch,
+        "aligned": workspace.quoted_variant(folder) == "aligned",
+        "policy": checkpoint.content_hash(best[0][1]) if best else None,
+        "versions": workspace.versions(),
+    }
+
+
+def _merged(config: SweepConfig, asked: Job, folder: Path, path: Path) -> Any:
+    arrays = shards.merge(path, asked.shape, asked.part, asked.grid, _header(config, folder))
+    return asked.record(**asked.grid, **arrays)

@@ -262,7 +262,8 @@ def run(config: TableConfig, console: Console) -> Path:
             _merge_all(config, read(config.file, fresh), fresh)
         return config.file
     missing = [cell for cell in asked if _get(table, "results", cell) is None]
-    console.print(f"{len(asked)} cells, {len(asked) - len(missing)} done, into {config.file}")
+    done = len(asked) - len(missing)
+    console.print(f"{len(asked)} cells, {done} done, into {config.file}", markup=False)
     took: list[float] = []
     for number, cell in enumerate(missing):
         try:
@@ -290,7 +291,8 @@ def _run_cell(
             took.append(time.monotonic() - start)
         else:
             _put(table, "failed", cell, str(log))
-            console.print(f"{cell.name} failed (exit code {code}): see {log}", style="bold red")
+            words = f"{cell.name} failed (exit code {code}): see {log}"
+            console.print(words, style="bold red", markup=False)
         _note_origin(table["header"], fresh)
         _store(config.file, table)
 
@@ -451,7 +453,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if config.page is not None:
             written = table_page.write(config.file, config.page)
-            console.print(f"Written: {', '.join(map(str, written))}", highlight=False)
+            console.print(f"Written: {', '.join(map(str, written))}", highlight=False, markup=False)
             return 0
         with interrupts.raising():
             path = run(config, console)
@@ -462,5 +464,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         console.print("Stopped; the same command goes on with what is missing.")
         return 130
     failed = list(_cells_of(records.load_json(path), "failed")) if path.exists() else []
-    console.print(f"Results: {path}" + (f"; {len(failed)} cells failed" if failed else ""))
+    words = f"; {len(failed)} cells failed" if failed else ""
+    console.print(f"Results: {path}{words}", markup=False)
     return 1 if failed else 0

@@ -30,7 +30,12 @@ def markers(preset: str) -> tuple[str, str]:
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return "\n".join("| " + " | ".join(map(_cell, line)) + " |" for line in lines)
+
+
+def _cell(words: str) -> str:
+    """Words that end neither their cell nor their line, and begin no HTML."""
+    return " ".join(words.split()).replace("|", "\\|").replace("<", "&lt;")
 
 
 def _number(value: float) -> str:
@@ -150,15 +155,15 @@ def text(table: Mapping[str, Any], drawn: Mapping[str, Sequence[str]]) -> str:
       drawn: task -> paths of its figures, relative to the page.
     """
     rows, header = rows_of(table), table["header"]
-    parts = [f"## The main table, preset `{header['preset']}`", _conditions(header)]
+    parts = [f"## The main table, preset `{header['preset']}`", _cell(_conditions(header))]
     parts += ["### Means over the tasks", _means(rows), "### The claims", _claims(rows)]
     missing, failed = _missing(table), list(_failed(table))
     if missing:
         parts.insert(1, f"Not complete: {'; '.join(missing)} not run yet.")
     if failed:
-        parts.append(f"Failed, and in no number above: {'; '.join(failed)}.")
+        parts.append(f"Failed, and in no number above: {_cell('; '.join(failed))}.")
     for task, row in table["results"].items():
-        parts += [f"### {paper.task_label(task)}", _task(header, task, row)]
+        parts += [f"### {_cell(paper.task_label(task))}", _task(header, task, row)]
         parts += [f"![{Path(path).stem}]({path})" for path in drawn.get(task, ())]
     return "\n\n".join(parts)
 
@@ -192,7 +197,7 @@ def draw(task: str, methods: Mapping[str, Mapping[str, DomainRecord]], folder: P
     pair = {name: methods[name] for name in ("bc", "palm") if name in methods}
     made = []
     if pair:
-        made.append(folder / f"samples_{task}.png")
+        made.append(folder / f"samples_{records.file_word(task)}.png")
         figures.save(figures.sample_distribution(pair, regions), made[-1])
     maps = {
         name: grids.grid_of_records(
@@ -201,7 +206,7 @@ def draw(task: str, methods: Mapping[str, Mapping[str, DomainRecord]], folder: P
         for name in paper.ordered_methods(list(methods))
     }
     if maps:
-        made.append(folder / f"heatmaps_{task}.png")
+        made.append(folder / f"heatmaps_{records.file_word(task)}.png")
         figures.save(figures.heatmaps(maps, regions), made[-1], dpi=110)
     return made
 

@@ -192,6 +192,9 @@ def _flat_tensors(loaded: Any) -> dict[str, _Tensor]:
 def _read_zip(data: bytes) -> dict[str, np.ndarray]:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         names = archive.namelist()
+        # torch.save compresses nothing: what unpacks to more than the file is no state dict.
+        if sum(entry.file_size for entry in archive.infolist()) > len(data):
+            raise ValueError("the archive unpacks to more than its own size")
         pickles = [name for name in names if name.split("/")[1:] == ["data.pkl"]]
         if len(pickles) != 1:
             raise ValueError("the archive has no data.pkl: not written by torch.save")

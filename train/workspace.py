@@ -36,10 +36,17 @@ _PACKAGES = (
 _FREE = ("out", "resume", "data", "sweep", "videos", "method")
 """Fields in which a resumed command may differ from the one that began."""
 
+_NOT_STORED = ("distributed",)
+"""Fields of the machines alone: no run folder holds them."""
+
+
+def _stored_fields() -> list[str]:
+    return [f.name for f in dataclasses.fields(Config) if f.name not in _NOT_STORED]
+
 
 def stored(config: Config, method: str) -> dict[str, Any]:
     """What `config.json` of one method's run folder holds."""
-    values = {f.name: getattr(config, f.name) for f in dataclasses.fields(Config)}
+    values = {name: getattr(config, name) for name in _stored_fields()}
     low, high = shifts.TEST_LOW, shifts.TEST_HIGH
     regions = {
         "train_x": (0.15, 0.35),
@@ -102,12 +109,17 @@ def environment(config: Config, *, wall_s: float) -> dict[str, Any]:
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}",
         "devices": [str(device) for device in jax.devices()],
-        "versions": {name: metadata.version(name) for name in _PACKAGES if _installed(name)}
-        | {"python": platform.python_version()},
+        "versions": versions(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
         "commit": _commit(),
         "wall_s": round(wall_s, 1),
     }
+
+
+def versions() -> dict[str, str]:
+    """Those of Python and of the packages that decide what comes out."""
+    found = {name: metadata.version(name) for name in _PACKAGES if _installed(name)}
+    return found | {"python": platform.python_version()}
 
 
 def _installed(name: str) -> bool:
@@ -146,8 +158,8 @@ def _commit() -> str | None:
 def stored_config(folder: Path) -> Config:
     """The configuration of a run folder, as the command saw it."""
     values = records.load_json(folder / "config.json")
-    names = {f.name for f in dataclasses.fields(Config)}
-    missing = sorted(names - set(values))
+    names = _stored_fields()
+    missing = sorted(set(names) - set(values))
     if missing:
         raise ConfigError(f"{folder}/config.json lacks {', '.join(missing)}: another version's run")
     chosen = {name: values[name] for name in names}

@@ -1,6 +1,7 @@
 """Sweeps: what is asked for, in which order it runs, and where its results end up."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,8 @@ import rooms
 
 from palm_jax.envs import make
 from palm_jax.envs.base import EnvParams
-from palm_jax.train import records, runs, sweep
+from palm_jax.train import records, runs, shards, sweep
+from palm_jax.train.shards import ShardError
 from palm_jax.train.sweep import SweepConfig
 
 
@@ -184,11 +186,93 @@ def test_files_are_named_after_robot_and_shift(tmp_path: Path) -> None:
     assert set(run.strengths) == {(robot, shift) for robot in ("", "ur5") for shift in both}
 
 
+def in_shards(options: SweepConfig, count: int, worlds: int) -> tuple[sweep.Job, list[Any], Any]:
+    """The job, its shards, and the undivided sweep."""
+    asked = sweep.job(options)
+    run = partial(asked.run, seed=0, aligned=True)
+    parts = []
+    for index in range(1, count + 1):
+        finished: list[int] = []
+        runner, _ = rooms.evaluator(worlds)
+        only = asked.part((index, count))
+        parts.append(run(runner, POLICY, only=only, progress=finished.append))
+        assert sum(finished) == len(only)
+    return asked, parts, run(rooms.evaluator(worlds)[0], POLICY)
+
+
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [
+        ({"camera": "-20:20:5", "workspace": "3x4", "batch": 7}, 3),
+        ({"camera": "-5", "workspace": "1x1", "batch": 7}, 2),  # the second one has nothing to do
+        ({"shift": "viewpoint", "episodes": 6, "batch": 3}, 2),
+    ],
+)
+def test_shards_join_to_the_undivided_sweep(
+    options: dict[str, Any], count: int, tmp_path: Path
+) -> None:
+    config = SweepConfig(run=tmp_path, **options)
+    asked, parts, whole = in_shards(config, count, config.batch)
+    path, header = records.sweep_path(tmp_path, shift=config.shift), {"seed": 0}
+    for index, part in enumerate(parts, 1):
+        shards.save(shards.path_of(path, index, count), vars(part), header)
+    arrays = shards.merge(path, asked.shape, asked.part, asked.grid, header)
+    assert whole.success.any() or whole.success.size == 1
+    for name in ("success", "nan"):
+        np.testing.assert_array_equal(arrays[name], getattr(whole, name))
+    assert arrays["worlds"] == config.batch
+    asked.save(path, asked.record(**asked.grid, **arrays))
+    assert not runs.load_run(tmp_path).problems and runs.find_runs(tmp_path) == []
+
+
+def test_shards_of_two_kinds_are_not_joined(tmp_path: Path) -> None:
+    config = SweepConfig(run=tmp_path, camera="-20:20:3", workspace="2x2", batch=4)
+    asked, parts, _ = in_shards(config, 3, 4)
+    path, header = records.sweep_path(tmp_path), {"seed": 0, "policy": "ab"}
+
+    def joined(expected: dict[str, Any] = header) -> Any:
+        return shards.merge(path, asked.shape, asked.part, asked.grid, expected)
+
+    with pytest.raises(ShardError, match="expected the shards of one sweep.*found none"):
+        joined()
+    for index in (1, 3):
+        shards.save(shards.path_of(path, index, 3), vars(parts[index - 1]), header)
+    with pytest.raises(ShardError, match="the shards 2/3 are missing.*--shard 2/3"):
+        joined()
+    second = shards.path_of(path, 2, 3)
+    shards.save(second, vars(parts[1]), {**header, "policy": "cd"})
+    with pytest.raises(ShardError, match="2-of-3.npz was made with policy = 'cd', here it is 'ab'"):
+        joined()
+    shards.save(second, {**vars(parts[1]), "xs": parts[1].xs + 0.1}, header)
+    with pytest.raises(ShardError, match="2-of-3.npz: its xs are not those of this command"):
+        joined()
+    shards.save(second, {**vars(parts[1]), "nan": parts[1].nan[:1]}, header)
+    with pytest.raises(ShardError, match=r"nan: expected shape \(3, 2, 2, 1\), got \(1, 2, 2, 1\)"):
+        joined()
+    records.save_sweep(second, parts[1])
+    with pytest.raises(ShardError, match="not a shard of a sweep"):
+        joined()
+    shards.save(second, vars(parts[1]), header)
+    assert joined()["success"].shape == (3, 2, 2, 1)
+    shards.save(shards.path_of(path, 1, 2), vars(parts[0]), header)
+    with pytest.raises(ShardError, match="found 2 parts and 3 parts"):
+        joined()
+
+
+@pytest.mark.parametrize("text", ["0/2", "3/2", "1", "1/", "/2", "-1/2", "1/2/3", "a/b"])
+def test_shards_that_are_none(text: str) -> None:
+    assert shards.parse("2/3") == (2, 3)
+    with pytest.raises(ShardError, match="expected i/n with i from 1 to n"):
+        shards.parse(text)
+
+
 def test_wrong_sweep_commands_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for words, message in (
         ([str(tmp_path)], "no run folder here"),
         ([str(tmp_path), "--robot", "r2d2"], "unknown robot 'r2d2'; known: panda"),
         ([str(tmp_path), "--shift", "fog"], "unknown shift 'fog'"),
+        ([str(tmp_path), "--shard", "3/2"], "shard: expected i/n with i from 1 to n, got '3/2'"),
+        ([str(tmp_path), "--shard", "1/2", "--merge"], "--merge alone joins the shards"),
     ):
         assert sweep.main(words) == 2
         assert message in " ".join(capsys.readouterr().out.split())

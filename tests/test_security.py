@@ -1,0 +1,313 @@
+"""Files of strangers: they run nothing, lead nowhere else, and are printed as text."""
+
+import ast
+import html.parser
+import json
+import shutil
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from palm_jax.train import checkpoint, demos, pictures, records, report, table_page, torch_files
+from palm_jax.train.checkpoint import DamagedCheckpoint
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = sorted(
+    path
+    for folder in ("palm_jax", "envs", "train")
+    for path in (ROOT / folder).rglob("*.py")
+    if not (folder == "palm_jax" and {"envs", "train"} & set(path.relative_to(ROOT).parts))
+)
+
+UNPICKLERS = {"pickle", "_pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal",
+              "pandas", "yaml", "torch"}  # fmt: skip
+"""Modules that run what a file says, or have a reader that does."""
+MAY_IMPORT = {"train/torch_files.py": {"pickle"}}
+RUNS = {"eval", "exec", "compile", "__import__"}
+UNPACKS = {"extractall", "extract", "unpack_archive", "popen", "mktemp"}
+
+
+# ------------------------------------------------------------------------------- the source itself
+
+
+def dotted(node: ast.AST) -> str:
+    """ "np.load" of the expression np.load; empty for what is no name."""
+    if isinstance(node, ast.Attribute):
+        return f"{dotted(node.value)}.{node.attr}"
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def option(call: ast.Call, name: str) -> Any:
+    return next((ast.unparse(k.value) for k in call.keywords if k.arg == name), None)
+
+
+def offences(source: str, allowed: set[str] = frozenset()) -> Iterator[str]:  # type: ignore[assignment]
+    """What in a module could run what a file says."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module]
+            yield from (
+                f"import {name}"
+                for name in names
+                if name and name.split(".")[0] in UNPICKLERS - allowed
+            )
+        if not isinstance(node, ast.Call):
+            continue
+        name = dotted(node.func)
+        last = name.rpartition(".")[2]
+        if name in RUNS or name == "os.system" or last in UNPACKS:
+            yield f"{name}(...)"
+        if last in ("load", "fromfile") and name.split(".")[0] in ("np", "numpy", "jnp"):
+            if option(node, "allow_pickle") != "False":
+                yield f"{name} without allow_pickle=False"
+        if name.startswith("pickle.") and last in ("load", "loads"):
+            yield f"{name}(...)"
+        if option(node, "shell") == "True":
+            yield f"{name} with shell=True"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_nothing_runs_what_a_file_says(path: Path) -> None:
+    allowed = MAY_IMPORT.get(str(path.relative_to(ROOT)), set())
+    assert list(offences(path.read_text(), allowed)) == []
+
+
+@pytest.mark.parametrize(
+    "source",
+    ["import pickle", "from pickle import loads", "import torch.nn", "eval('1')", "exec(text)",
+     "np.load(path)", "np.load(path, allow_pickle=True)", "numpy.load(p, allow_pickle=flag)",
+     "yaml.load(x)\nimport yaml", "archive.extractall()", "os.system(x)", "run(x, shell=True)",
+     "__import__(name)", "compile(text, 'f', 'exec')"],
+)  # fmt: skip
+def test_the_search_finds_them(source: str) -> None:
+    assert list(offences(source))
+
+
+def test_the_search_lets_pass_what_is_safe() -> None:
+    safe = "re.compile(x)\nnp.load(p, allow_pickle=False)\njson.load(f)\nnp.save(p, x)"
+    assert list(offences(safe)) == [] and len(SOURCES) > 60
+    # The one that reads .pth files names what it knows, and calls no ready-made loader.
+    assert list(offences((ROOT / "train/torch_files.py").read_text())) == ["import pickle"]
+
+
+# ---------------------------------------------------------------------------------------- arrays
+
+
+class Touch:
+    """Pickled, this makes a file when it is loaded."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return (Path.touch, (self.path,))
+
+
+def test_arrays_of_objects_are_not_read(tmp_path: Path) -> None:
+    trap = tmp_path / "trap"
+    np.savez(tmp_path / "eval.npz", **{"ID/success": np.array([Touch(trap)], object)})
+    with pytest.raises(records.RecordError, match="not a readable .npz file"):
+        records.load_eval(tmp_path / "eval.npz")
+    assert not trap.exists()
+
+
+def test_an_archive_that_unpacks_to_more_is_refused(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "a.pth", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a/data.pkl", b"\x80\x02}.")
+        archive.writestr("a/data/0", bytes(10_000_000))
+    with pytest.raises(ValueError, match="unpacks to more than its own size"):
+        torch_files.read_tensors(tmp_path / "a.pth")
+
+
+def test_pictures_are_of_the_kinds_that_they_say(tmp_path: Path) -> None:
+    """A PostScript program is none, whatever its name."""
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png", format="EPS")
+    with pytest.raises(ValueError, match="a.png cannot be read as a picture"):
+        pictures.read_folder(tmp_path, 8)
+
+
+# ------------------------------------------------------------------------------------ checkpoints
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return checkpoint.save(tmp_path_factory.mktemp("checkpoints"), 3, {"a": np.arange(4.0)})
+
+
+def forged(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    """A manifest with a right checksum, by somebody who knows how."""
+    content = json.loads((path / checkpoint.MANIFEST).read_text())
+    change(content)
+    checkpoint._write_manifest(path, content)
+
+
+@pytest.mark.parametrize("name", ["../secret", "/etc/hostname", "arrays/../../secret", ""])
+def test_a_manifest_names_no_file_elsewhere(name: str, saved: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copytree(saved, tmp_path / "checkpoints" / "3"))
+    forged(path, lambda content: content["files"].update({name: {"size": 0, "sha256": ""}}))
+    with pytest.raises(DamagedCheckpoint, match="way-out"):
+        checkpoint.verify(path)
+    assert checkpoint.latest_valid(path.parent) is None
+    assert (path.parent / "damaged" / "3-way-out").is_dir()
+
+
+def _link_a_file(path: Path) -> None:
+    file = max((p for p in (path / "arrays").rglob("*") if p.is_file()), key=lambda p: len(p.parts))
+    file.rename(path.parent / "elsewhere")
+    file.symlink_to(path.parent / "elsewhere")
+
+
+def _link_the_arrays(path: Path) -> None:
+    (path / "arrays").rename(path.parent / "elsewhere")
+    (path / "arrays").symlink_to(path.parent / "elsewhere")
+
+
+def _link_the_manifest(path: Path) -> None:
+    (path / checkpoint.MANIFEST).rename(path.parent / "elsewhere")
+    (path / checkpoint.MANIFEST).symlink_to(path.parent / "elsewhere")
+
+
+def _link_all(path: Path) -> None:
+    path.rename(path.parent / "elsewhere")
+    path.symlink_to(path.parent / "elsewhere")
+
+
+@pytest.mark.parametrize("link", [_link_a_file, _link_the_arrays, _link_the_manifest, _link_all])
+def test_nothing_in_a_checkpoint_is_a_link(
+    link: Callable[[Path], None], saved: Path, tmp_path: Path
+) -> None:
+    path = Path(shutil.copytree(saved, tmp_path / "3"))
+    link(path)
+    with pytest.raises(DamagedCheckpoint, match="link"):
+        checkpoint.verify(path)
+    with pytest.raises(DamagedCheckpoint, match="link"):
+        checkpoint.load(path, {"a": np.zeros(4)})
+
+
+def test_meta_data_are_not_written_through_a_link(saved: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copytree(saved, tmp_path / "3"))
+    _link_the_manifest(path)
+    before = (tmp_path / "elsewhere").read_bytes()
+    with pytest.raises(DamagedCheckpoint, match="link"):
+        checkpoint.update_meta(path, score=1.0)
+    assert (tmp_path / "elsewhere").read_bytes() == before
+
+
+# --------------------------------------------------------------------------------- demonstrations
+
+
+@pytest.mark.parametrize("kind", ["external link", "soft link", "virtual array", "outside array"])
+def test_demonstrations_lie_in_their_own_file(kind: str, tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "other.hdf5", "w") as other:
+        other["x"] = np.zeros(4)
+    with h5py.File(tmp_path / "demos.hdf5", "w") as file:
+        group = file.create_group("data/demo_0")
+        if kind == "external link":
+            group["actions"] = h5py.ExternalLink(str(tmp_path / "other.hdf5"), "/x")
+        elif kind == "soft link":
+            group["actions"] = h5py.SoftLink("/data")
+        elif kind == "virtual array":
+            layout = h5py.VirtualLayout((4,), "f8")
+            layout[:] = h5py.VirtualSource(tmp_path / "other.hdf5", "x", (4,))
+            group.create_virtual_dataset("actions", layout)
+        else:
+            where = [(str(tmp_path / "raw"), 0, 32)]
+            group.create_dataset("actions", (4,), "f8", external=where)
+    with pytest.raises(demos.DemoFileError, match="actions (is a link|lies in another file)"):
+        demos.load(tmp_path / "demos.hdf5", task="lift_lid", robot="panda")
+
+
+# ------------------------------------------------------------------------------------------ pages
+
+HOSTILE = "<img src=x onerror=alert(1)>\"'&$\\frac{${|../../up"
+
+
+class Seen(html.parser.HTMLParser):
+    """Tags and attributes of a page."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: set[str] = set()
+        self.attributes: dict[str, list[str]] = {}
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        for name, value in attrs:
+            self.attributes.setdefault(name, []).append(value or "")
+
+
+def hostile_run(folder: Path, **config: Any) -> None:
+    """A run in which every text is hostile, but for the file names."""
+    folder.mkdir(parents=True)
+    some = {
+        "success": np.arange(8) < 5, "nan": np.zeros(8, bool), "object_xy": np.zeros((8, 2)),
+        "camera_angle": np.zeros(8), "length": np.ones(8), "draws": np.ones(8),
+    }  # fmt: skip
+    name = HOSTILE.replace("/", "")
+    record = {"in_domain": some, name: some}
+    records.save_eval(folder / "eval.npz", record)
+    counts = {"successes": 5, "episodes": 8, "nan": 1}
+    (folder / "eval.json").write_text(json.dumps({"in_domain": counts, name: counts}))
+    variants = {"quoted": HOSTILE, HOSTILE: {f"viewpoint{HOSTILE}": counts, "viewpoint": counts}}
+    (folder / "eval_variants.json").write_text(json.dumps(variants))
+    (folder / "config.json").write_text(json.dumps({"method": HOSTILE, HOSTILE: HOSTILE, **config}))
+    about = {
+        "command": HOSTILE, "machine": HOSTILE, "date": HOSTILE, "commit": HOSTILE,
+        "versions": {HOSTILE: HOSTILE}, "devices": [HOSTILE],
+    }  # fmt: skip
+    (folder / "env.json").write_text(json.dumps(about))
+    lines = [json.dumps({"step": step, "loss": 1.0, HOSTILE: 2.0}) for step in range(3)]
+    (folder / "metrics.jsonl").write_text("\n".join(lines) + "\n<script>\n")
+    curve = records.StrengthSweep(HOSTILE, np.arange(2.0), np.ones((2, 3), bool), np.zeros((2, 3)))
+    records.save_strengths(folder / "strength-x.npz", curve)
+
+
+@pytest.mark.filterwarnings("ignore:Glyph")
+def test_a_page_prints_hostile_texts_and_writes_below_its_folder(tmp_path: Path) -> None:
+    root = tmp_path / "deep" / "runs"
+    hostile_run(root / "a", task=HOSTILE, preset=HOSTILE, robot=HOSTILE, seed=HOSTILE)
+    hostile_run(root / "b", task="../../../up")
+    page = report.write_report(root).read_text()
+    seen = Seen(page)
+    assert "onerror" not in seen.attributes and "script" not in seen.tags
+    assert all(value.startswith("data:") for value in seen.attributes["src"])
+    assert "onerror=alert" in page and "<img src=x" not in page
+    outside = [p for p in tmp_path.rglob("*") if p.is_file() and root not in p.parents]
+    assert outside == []
+
+
+def test_a_page_does_not_carry_what_links_point_at(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    hostile_run(run)
+    Image.new("RGB", (4, 4), (1, 2, 3)).save(tmp_path / "private.png")
+    (tmp_path / "private.mp4").write_bytes(b"\0\0\0\x18ftypmp42")
+    for folder, name in (("figures", "private.png"), ("videos", "private.mp4")):
+        (run / folder).mkdir()
+        (run / folder / name).symlink_to(tmp_path / name)
+    found, clips = report._media(run, [])
+    assert found == [] and clips == []
+
+
+def test_a_table_page_stays_a_table(tmp_path: Path) -> None:
+    cell = table_page.markdown(["a"], [["x | y\n\n<!-- table cpu: end --><script>"]])
+    assert cell.splitlines()[2] == "| x \\| y &lt;!-- table cpu: end -->&lt;script> |"
+    assert records.file_word("../../up/x y") == "-up-x-y" and records.file_word("lift_lid+a-1")
+
+
+def test_a_run_folder_decides_no_path() -> None:
+    """`out` and `data` of a config.json are notes: commands get both from their own words."""
+    readers = [path for path in SOURCES if "stored_config(" in path.read_text()]
+    for path in readers:
+        if path.name == "workspace.py":  # makes it
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Attribute) and dotted(node.value) in ("stored", "config"):
+                assert node.attr not in ("out", "data", "backgrounds"), path
+    assert {path.name for path in readers} == {"workspace.py", "sweep.py", "policy.py"}
