@@ -15,10 +15,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("palm_jax: loading JAX and MuJoCo ...", flush=True)
     warnings.filterwarnings("ignore", message=".*donated buffers were not usable.*")
     with without_lines():  # MJX's complaints about the missing warp back end
+        from palm_jax._checks import OptionError
         from palm_jax.envs.rollout import StartPoseError
         from palm_jax.train import config as configuration
         from palm_jax.train import console as terminal
-        from palm_jax.train import devices, interrupts, run
+        from palm_jax.train import devices, interrupts, recorded, run, training
+        from palm_jax.train.data.errors import DataError
         from palm_jax.train.demos import DemoFileError
         from palm_jax.train.learner import NonFiniteError
         from palm_jax.train.locks import Busy
@@ -27,28 +29,34 @@ def main(argv: Sequence[str] | None = None) -> int:
     console = terminal.make_console()
     try:
         config = configuration.parse(words)
-        if config.distributed:
+        if isinstance(config, configuration.Config) and config.distributed:
             devices.connect(config.distributed)
     except (configuration.ConfigError, devices.DeviceError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     try:
         with interrupts.raising():
-            run.execute(config, console)
+            if isinstance(config, configuration.Config):
+                run.execute(config, console)
+            else:
+                recorded.execute(config, console)
     except (
         configuration.ConfigError, devices.DeviceError, DemoFileError, StartPoseError, RecordError,
         Busy,
     ) as error:  # fmt: skip
         print(f"error: {error}", file=sys.stderr)
         return devices.leave(2)
+    except (DataError, OptionError) as error:
+        print(f"error: {type(error).__name__}: {error}", file=sys.stderr)
+        return 2
     except (NonFiniteError, MemoryError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return devices.leave(1)
     except KeyboardInterrupt as stop:
         if devices.is_first():
-            terminal.interrupted(console, run.resume_command(config))
+            terminal.interrupted(console, configuration.resume_command(config))
         # What all processes agreed on ends all of them in order.
-        return 130 if isinstance(stop, run.Interrupted) else devices.leave(130)
+        return 130 if isinstance(stop, training.Interrupted) else devices.leave(130)
     except Exception:
         if devices.alone():
             raise

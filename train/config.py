@@ -5,13 +5,17 @@ import difflib
 import math
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import tyro
 
 from palm_jax.envs.registry import ROBOTS, TASKS
 from palm_jax.envs.shifts import AXES, DOMAINS, EMBODIMENT, SHIFTS, parts
 from palm_jax.train import methods
+from palm_jax.train.data.recording import LEAST_IN_VIEW
 from palm_jax.train.learner import LearnerConfig
+
+AnyConfig = TypeVar("AnyConfig", bound="Learning")
 
 
 class ConfigError(ValueError):
@@ -19,22 +23,18 @@ class ConfigError(ValueError):
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
-    """Train policies and evaluate them under distribution shift.
+class Learning:
+    """What a training is told whatever its data are.
 
     Attributes:
       task: what to learn.
       method: one or more methods; with several, each gets a folder of its own inside `out`.
       preset: where the defaults come from: quick, cpu or paper.
       seed: of training. Demonstrations and evaluation scenes have seeds of their own.
-      out: the run folder; by default runs/PRESET-TASK-METHODS-sSEED.
+      out: the run folder; by default one in runs/ that is named after the main options.
       resume: go on with the run in `out`.
-      robot: which arm demonstrates.
-      other_robot: the arm of `embodiment` domains; by default the first other one there is.
-      data: demonstrations to use (made if the file does not exist); by default inside `out`.
-      demos: number of demonstrations.
-      demo_seed: of the demonstrations.
-      demo_noise: disturbance while demonstrating, metres (standard deviation).
+      data: demonstrations to use (made if the file does not exist); by default inside `out`. With
+        --calibration: recordings of any robot, a robomimic file or a LeRobot folder.
       image_size: side of the policy's image in pixels, before the random crop.
       random_crop: side of the random crop in pixels (centre crop when acting).
       width: base width of the ResNet-18; the paper's is 64.
@@ -51,16 +51,8 @@ class Config:
       turn: largest pan and tilt (degrees) of the random camera turn, another perspective that the
         rotation input follows; 0 0 for none, as in the paper.
       backgrounds: a folder of your own images for Random Overlay; procedural textures by default.
-      checkpoint_every: updates between checkpoints; each is scored in-domain from `select_from` on.
-      select_from: share of the training after which checkpoints are scored.
-      select_scenes: in-domain scenes that score a checkpoint.
+      checkpoint_every: updates between checkpoints.
       keep: checkpoints kept, by score.
-      scenes: evaluation scenes in each domain.
-      eval_seed: of the evaluation scenes.
-      domains: evaluation domains: in_domain, and shifts joined by +.
-      videos: episodes filmed for each outcome (success, failure) and method.
-      sweep: draw the success heatmaps and camera-angle curves after training.
-      distributed: train in several processes: auto, or HOST:PORT,COUNT,INDEX (docs/scaling.md).
     """
 
     task: str = "lift_lid"
@@ -69,12 +61,7 @@ class Config:
     seed: int = 0
     out: Path | None = None
     resume: bool = False
-    robot: str = "panda"
-    other_robot: str = ""
     data: Path | None = None
-    demos: int = 100
-    demo_seed: int = 0
-    demo_noise: float = 0.004
     image_size: int = 64
     random_crop: int = 58
     width: int = 16
@@ -91,20 +78,7 @@ class Config:
     turn: tuple[float, float] = (0.0, 0.0)
     backgrounds: Path | None = None
     checkpoint_every: int = 600
-    select_from: float = 0.7
-    select_scenes: int = 24
     keep: int = 3
-    scenes: int = 24
-    eval_seed: int = 1000
-    domains: tuple[str, ...] = DOMAINS
-    videos: int = 1
-    sweep: bool = True
-    distributed: str = ""
-
-    @property
-    def second_robot(self) -> str:
-        """The robot of `embodiment` domains, `other_robot` resolved."""
-        return self.other_robot or next(name for name in ROBOTS if name != self.robot)
 
     def learner(self, method: methods.Method) -> LearnerConfig:
         """The learner's configuration for a method: the same for all, but for augmentation."""
@@ -131,19 +105,9 @@ class Config:
 
     def check(self) -> None:
         """Raises ConfigError for values that cannot work."""
-        _known("task", [self.task], TASKS)
-        _known("robot", [self.robot], ROBOTS)
         for method in self.method:
             _known("method", method.split("+"), methods.METHODS)
-        if self.other_robot:
-            _known("robot", [self.other_robot], ROBOTS)
-        if self.other_robot == self.robot:
-            raise ConfigError(
-                f"other_robot: expected another robot than robot = {self.robot!r}, e.g. "
-                f"{dataclasses.replace(self, other_robot='').second_robot!r}"
-            )
-        _check_domains(self.domains)
-        for name in ("demos", "scenes", "select_scenes", "steps", "checkpoint_every", "keep"):
+        for name in ("steps", "checkpoint_every", "keep"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name}: expected at least 1, got {getattr(self, name)}")
         if self.random_crop > self.image_size:
@@ -160,6 +124,142 @@ class Config:
                 self.learner(methods.find(method))
         except ValueError as error:
             raise ConfigError(str(error)) from error
+
+    def folder_name(self) -> str:
+        """Of the run folder in runs/ where none is given."""
+        raise NotImplementedError
+
+
+@dataclasses.dataclass(frozen=True)
+class Config(Learning):
+    """Train policies in the simulator and evaluate them under distribution shift.
+
+    With --calibration FILE the data are recordings of a robot, and nothing is simulated: see
+    --calibration FILE --help.
+
+    Attributes:
+      robot: which arm demonstrates.
+      other_robot: the arm of `embodiment` domains; by default the first other one there is.
+      demos: number of demonstrations.
+      demo_seed: of the demonstrations.
+      demo_noise: disturbance while demonstrating, metres (standard deviation).
+      select_from: share of the training after which checkpoints are scored in-domain.
+      select_scenes: in-domain scenes that score a checkpoint.
+      scenes: evaluation scenes in each domain.
+      eval_seed: of the evaluation scenes.
+      domains: evaluation domains: in_domain, and shifts joined by +.
+      videos: episodes filmed for each outcome (success, failure) and method.
+      sweep: draw the success heatmaps and camera-angle curves after training.
+      distributed: train in several processes: auto, or HOST:PORT,COUNT,INDEX (docs/scaling.md).
+    """
+
+    robot: str = "panda"
+    other_robot: str = ""
+    demos: int = 100
+    demo_seed: int = 0
+    demo_noise: float = 0.004
+    select_from: float = 0.7
+    select_scenes: int = 24
+    scenes: int = 24
+    eval_seed: int = 1000
+    domains: tuple[str, ...] = DOMAINS
+    videos: int = 1
+    sweep: bool = True
+    distributed: str = ""
+
+    @property
+    def second_robot(self) -> str:
+        """The robot of `embodiment` domains, `other_robot` resolved."""
+        return self.other_robot or next(name for name in ROBOTS if name != self.robot)
+
+    def check(self) -> None:
+        """Raises ConfigError for values that cannot work."""
+        _known("task", [self.task], TASKS)
+        _known("robot", [self.robot], ROBOTS)
+        super().check()
+        if self.other_robot:
+            _known("robot", [self.other_robot], ROBOTS)
+        if self.other_robot == self.robot:
+            raise ConfigError(
+                f"other_robot: expected another robot than robot = {self.robot!r}, e.g. "
+                f"{dataclasses.replace(self, other_robot='').second_robot!r}"
+            )
+        _check_domains(self.domains)
+        for name in ("demos", "scenes", "select_scenes"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name}: expected at least 1, got {getattr(self, name)}")
+
+    def folder_name(self) -> str:
+        """PRESET-TASK-METHODS-sSEED."""
+        return f"{'-'.join((self.preset, self.task, *self.method))}-s{self.seed}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Recorded(Learning):
+    """Train policies on recordings of a robot, without a simulator (docs/your_data.md).
+
+    Checkpoints are chosen by their loss on episodes that are held out, as the paper does for its
+    real robot.
+
+    Attributes:
+      task: what is done, in words; by default what the data say.
+      calibration: calibration.json of the cameras (`python -m palm_jax data calibrate`).
+      camera: name; by default the only one with images.
+      crop: pixels per side of the TCP-centred window, in the camera's image; by default the
+        paper's 200 of 512 rows.
+      offset: pixels from the TCP to the window's middle, right and down; by default the paper's 40
+        of 512 rows, down.
+      axis_length: of the overlay, metres.
+      transitions: frames with so many largest motions of an episode get the label "stay", as in
+        the authors' code; for recordings in which the hand is moved between two stages.
+      validation: share of the episodes that is held out, 0 for none (the last checkpoint is then
+        taken); by default the file's own split (robomimic's filter keys train and valid), else a
+        tenth.
+      least_in_view: share of frames that must show the TCP.
+      trust: skip looking at the images for a wrong calibration.
+    """
+
+    task: str = ""
+    calibration: Path | None = None
+    camera: str | None = None
+    crop: int | None = None
+    offset: tuple[int, int] | None = None
+    axis_length: float = 0.1
+    transitions: int = 0
+    validation: float | None = None
+    least_in_view: float = LEAST_IN_VIEW
+    trust: bool = False
+
+    def check(self) -> None:
+        """Raises ConfigError for values that cannot work."""
+        super().check()
+        if self.data is None or self.calibration is None:
+            raise ConfigError(
+                "expected --data FILE with --calibration C: recordings, and where their camera is "
+                "(python -m palm_jax data calibrate)"
+            )
+        for name in self.method:
+            method = methods.find(name)
+            if method.transforms or method.isolate:
+                raise ConfigError(
+                    f"method {name!r} needs the simulator ({method.title}); on recordings: "
+                    + ", ".join(RECORDED_METHODS)
+                )
+        if self.validation is not None and not 0 <= self.validation < 1:
+            raise ConfigError(f"validation: expected a share from 0 to 1, got {self.validation}")
+        if self.transitions < 0:
+            raise ConfigError(f"transitions: expected 0 or more, got {self.transitions}")
+
+    def folder_name(self) -> str:
+        """DATA-METHODS-sSEED."""
+        stem = self.data.stem if self.data else "recorded"
+        return f"{'-'.join((stem, *self.method))}-s{self.seed}"
+
+
+RECORDED_METHODS = tuple(
+    name for name, method in methods.METHODS.items() if not (method.transforms or method.isolate)
+)
+"""Methods that need nothing but images, poses and a calibration."""
 
 
 def _check_domains(domains: Sequence[str]) -> None:
@@ -243,16 +343,30 @@ PRESETS = {"quick": quick, "cpu": cpu, "paper": paper}
 """Defaults by name; the command line overrides single fields."""
 
 
-def parse(argv: Sequence[str]) -> Config:
-    """The configuration of a command line: the preset's, with what is given instead.
+def defaults(kind: type[AnyConfig], preset: str) -> AnyConfig:
+    """What a preset says of a kind of training."""
+    if kind is Config:
+        return PRESETS[preset]()  # type: ignore[return-value]
+    learning = {f.name for f in dataclasses.fields(Learning)} - {"task"}
+    return kind(**{name: getattr(PRESETS[preset](), name) for name in learning})
+
+
+def parse(argv: Sequence[str]) -> Config | Recorded:
+    """The configuration of a command line: the preset's, with what is given instead. With
+    --calibration it is that of a training on recordings.
 
     Raises:
       ConfigError: an unknown preset, task, method, robot or domain, or an impossible value.
       SystemExit: `--help`, or an unknown option (the known ones are printed).
     """
+    recorded = any(word.split("=")[0] == "--calibration" for word in argv)
+    return _parsed(argv, Recorded) if recorded else _parsed(argv, Config)
+
+
+def _parsed(argv: Sequence[str], kind: type[AnyConfig]) -> AnyConfig:
     name = _preset(argv)
     _known("preset", [name], PRESETS)
-    fields = {f"--{f.name.replace('_', '-')}" for f in dataclasses.fields(Config)}
+    fields = {f"--{f.name.replace('_', '-')}" for f in dataclasses.fields(kind)}
     for word in argv:
         option = word.split("=")[0].replace("_", "-")
         plain = option.replace("--no-", "--", 1)
@@ -260,8 +374,8 @@ def parse(argv: Sequence[str]) -> Config:
             near = difflib.get_close_matches(option, fields, n=1)
             hint = f" (did you mean {near[0]}?)" if near else ""
             raise ConfigError(f"unknown option {option}{hint}; known: {', '.join(sorted(fields))}")
-    config: Config = tyro.cli(
-        Config, args=list(argv), default=PRESETS[name](), prog="python -m palm_jax.train"
+    config: AnyConfig = tyro.cli(
+        kind, args=list(argv), default=defaults(kind, name), prog="python -m palm_jax.train"
     )
     config.check()
     return config
@@ -276,17 +390,16 @@ def _preset(argv: Sequence[str]) -> str:
     return "quick"
 
 
-def default_out(config: Config) -> Path:
+def default_out(config: Learning) -> Path:
     """Where a run goes that was not told where."""
-    name = "-".join((config.preset, config.task, *config.method))
-    return Path("runs") / f"{name}-s{config.seed}"
+    return Path("runs") / config.folder_name()
 
 
-def command(config: Config, *, resume: bool = False) -> list[str]:
+def command(config: Learning, *, resume: bool = False) -> list[str]:
     """The command line that gives this configuration again."""
-    base, words = PRESETS[config.preset](), ["python", "-m", "palm_jax.train"]
+    base, words = defaults(type(config), config.preset), ["python", "-m", "palm_jax.train"]
     words += ["--preset", config.preset]
-    for field in dataclasses.fields(Config):
+    for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if field.name in ("preset", "resume") or value == getattr(base, field.name):
             continue
@@ -298,3 +411,9 @@ def command(config: Config, *, resume: bool = False) -> list[str]:
         else:
             words += [flag, str(value)]
     return [*words, "--resume"] if resume else words
+
+
+def resume_command(config: Learning) -> list[str]:
+    """The command line that goes on with a run."""
+    out = config.out or default_out(config)
+    return command(dataclasses.replace(config, out=out), resume=True)

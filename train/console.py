@@ -9,7 +9,7 @@ import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from rich import box
 from rich.console import Console
@@ -285,6 +285,42 @@ def _loss(by_domain: Mapping[str, Mapping[str, int]], domain: str) -> float | No
 
 def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.2f}".replace("-0.00", "0.00")
+
+
+HELD_OUT = ("loss", "translation, median error", "rotation, median error", "gripper right")
+"""Of what `held_out_cells` gives."""
+
+HELD_OUT_NOTE = "In brackets: a policy that never moves and never changes the gripper."
+
+
+def held_out_cells(found: Mapping[str, Any]) -> list[str]:
+    """A row of figures on episodes held out, from `palm_jax.train.held_out.measure`."""
+    move, turn, gripper = (found[name] for name in ("translation_mm", "rotation_deg", "gripper"))
+    return [
+        f"{found['loss']:.4f}",
+        f"{move['median_error']:.1f} mm ({move['standing_still']:.1f})",
+        f"{turn['median_error']:.1f}\N{DEGREE SIGN} ({turn['standing_still']:.1f})",
+        f"{gripper['right']:.0%} ({gripper['constant']:.0%})",
+    ]
+
+
+def held_out(console: Console, found: Mapping[str, Mapping[str, Any]]) -> None:
+    """The table of a training on recordings: method -> `palm_jax.train.held_out.measure`."""
+    if not found:
+        return
+    table = Table(
+        title="On the episodes held out",
+        box=box.SIMPLE_HEAD,
+        title_justify="left",
+        title_style="bold",
+    )
+    table.add_column("method")
+    for column in HELD_OUT:
+        table.add_column(column, justify="right")
+    for name in paper.ordered_methods(list(found)):
+        table.add_row(escape(paper.method_label(name)), *held_out_cells(found[name]))
+    console.print(table)
+    console.print(Text(HELD_OUT_NOTE, style="dim"))
 
 
 def interrupted(console: Console, command: Sequence[str], *, saved: str = "") -> None:

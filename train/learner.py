@@ -880,6 +880,45 @@ def check_skipped(skipped: int, step: int, config: LearnerConfig) -> None:
         )
 
 
+def predicted(
+    learner: Learner,
+    policy: PolicyState,
+    data: Batch,
+    *,
+    rows: ArrayLike | None = None,
+    batch_size: int = 256,
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a policy makes of labelled samples, without augmentation and noise.
+
+    Args:
+      learner: from `make_learner`.
+      policy: from `learner.policy_state`.
+      data: labelled samples in host memory.
+      rows: indices of the n samples to use; all by default.
+      batch_size: samples per call.
+
+    Returns:
+      prediction and label, [n, 10] each, normalised units.
+    """
+    indices = np.arange(len(data.proprio)) if rows is None else np.asarray(rows)
+    predictions = []
+    for start in range(0, len(indices), batch_size):
+        # Always a full batch, so that there is one compilation; the surplus is cut off.
+        chunk = np.resize(indices[start : start + batch_size], batch_size)
+        part = take(data, chunk)
+        prediction, _ = learner.jitted_predict(policy, part.images, part.proprio)
+        predictions.append(np.asarray(prediction))
+    labels = policy.normalizer.action.normalize(jnp.asarray(data.actions[indices]))
+    return np.concatenate(predictions)[: len(indices)], np.asarray(labels)
+
+
+def determination(predictions: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """[D] coefficient of determination of each column of [n, D]; NaN where labels are constant."""
+    residual = np.square(labels - predictions).sum(axis=0)
+    spread = np.square(labels - labels.mean(axis=0)).sum(axis=0)
+    return 1 - residual / np.where(spread > 0, spread, np.nan)
+
+
 def action_r2(
     learner: Learner,
     policy: PolicyState,
@@ -891,25 +930,6 @@ def action_r2(
     """Coefficient of determination of each action dimension, [10]; NaN where the label is constant.
 
     A low mean loss can hide that nothing was learnt sideways; look at this on the frames where the
-    gripper is open.
-
-    Args:
-      learner: from `make_learner`.
-      policy: from `learner.policy_state`.
-      data: labelled samples in host memory.
-      rows: indices of the samples to use; all by default.
-      batch_size: samples per call.
+    gripper is open. Arguments as of `predicted`.
     """
-    indices = np.arange(len(data.proprio)) if rows is None else np.asarray(rows)
-    predictions = []
-    for start in range(0, len(indices), batch_size):
-        # Always a full batch, so that there is one compilation; the surplus is cut off.
-        chunk = np.resize(indices[start : start + batch_size], batch_size)
-        part = take(data, chunk)
-        prediction, _ = learner.jitted_predict(policy, part.images, part.proprio)
-        predictions.append(np.asarray(prediction))
-    predicted = np.concatenate(predictions)[: len(indices)]
-    labels = np.asarray(policy.normalizer.action.normalize(jnp.asarray(data.actions[indices])))
-    residual = np.square(labels - predicted).sum(axis=0)
-    spread = np.square(labels - labels.mean(axis=0)).sum(axis=0)
-    return 1 - residual / np.where(spread > 0, spread, np.nan)
+    return determination(*predicted(learner, policy, data, rows=rows, batch_size=batch_size))

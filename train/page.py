@@ -8,10 +8,11 @@ import html
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from palm_jax.train import figures, paper
+from palm_jax.train import console, figures, paper
 from palm_jax.train.runs import Counts
 from palm_jax.train.stats import (
     degradation,
@@ -231,6 +232,38 @@ def _mean_cell(method: str, have: Sequence[Counts], domain: str) -> str:
     reference = f"paper {_loss(printed)}" if printed is not None else ""
     mean = float(losses.mean()) if losses.size else math.nan
     return f"{_loss(mean)}{_small(reference, 'paper')}"
+
+
+def held_out_table(found: Mapping[str, Mapping[str, Any]]) -> str:
+    """Rows: methods that were trained on recordings; `palm_jax.train.held_out.measure` of each."""
+    head = "".join(f'<th scope="col">{esc(text)}</th>' for text in ("method", *console.HELD_OUT))
+    rows = []
+    for name, entry in found.items():
+        cells = "".join(f"<td>{esc(text)}</td>" for text in console.held_out_cells(entry))
+        rows.append(
+            f'<tr><th scope="row"><i style="background:{figures.look(name).colour}"></i>'
+            f"{esc(paper.method_label(name))}</th>{cells}</tr>"
+        )
+    return (
+        f'<div class="scroll"><table class="results"><thead><tr>{head}</tr></thead>'
+        f"<tbody>{''.join(rows)}</tbody></table></div><p class=note>{esc(console.HELD_OUT_NOTE)}"
+        f"</p>{_determination(found)}"
+    )
+
+
+def _determination(found: Mapping[str, Mapping[str, Any]]) -> str:
+    """R² of each of the action's numbers, per method."""
+    names = list(dict.fromkeys(name for entry in found.values() for name in entry["r2"]))
+    head = "".join(f'<th scope="col">{esc(name)}</th>' for name in names)
+    rows = []
+    for method, entry in found.items():
+        values = (entry["r2"].get(name) for name in names)
+        cells = "".join(f"<td>{'–' if v is None else f'{v:.2f}'}</td>" for v in values)
+        rows.append(f'<tr><th scope="row">{esc(paper.method_label(method))}</th>{cells}</tr>')
+    return (
+        '<div class="scroll"><table class="results"><thead><tr><th scope="col">R² of</th>'
+        f"{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
+    )
 
 
 def tiles(counts: Mapping[str, Counts]) -> str:

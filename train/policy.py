@@ -16,6 +16,7 @@ import logging
 import math
 import time
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,8 +49,8 @@ from palm_jax.envs.base import (
 )
 from palm_jax.envs.registry import TASKS
 from palm_jax.envs.tasks import WORKSPACE_CENTRE
-from palm_jax.train import checkpoint, methods, runs, workspace
-from palm_jax.train.config import Config
+from palm_jax.train import checkpoint, methods, records, runs, workspace
+from palm_jax.train.config import Config, Recorded
 from palm_jax.train.evaluate import VIEW
 from palm_jax.train.learner import (
     Learner,
@@ -95,18 +96,19 @@ class Contract:
     """What a policy was trained with, as far as its user's inputs have to agree with it.
 
     The policy sees the field of view that it was trained with. `spec.crop` counts pixels of a frame
-    with the focal length `focal`; of a camera with the focal length f it is crop * f / focal pixels
+    with the intrinsics `K`; of a camera with the focal length f it is crop * f / K[0][0] pixels
     (with another resolution, other pixels of the same view). Equal angles are equal sizes at equal
     distances: for a camera that stands much nearer or farther than `distance`, see `load`'s `zoom`.
 
     Attributes:
-      method, task, robot: of the run.
+      method, task, robot: of the run; of recordings no robot is known ("").
       step: of the checkpoint.
       spec: what the policy sees.
-      focal: pixels, of the frame that the spec's pixels are counted in.
-      frame: rows and columns of that frame, with its principal point in the middle.
+      K: 3 x 3 intrinsics of the frame that the spec's pixels are counted in.
+      frame: rows and columns of that frame.
       rendered: trained on rendered windows (`align_window`), not on camera images (`align`).
-      distance: metres from the training's camera to the middle of the workspace.
+      distance: metres from the training's camera to the middle of the workspace; of recordings, to
+        the TCP on average.
       heights: lowest and highest z of the TCP in training, metres, world; None if not an input.
       rate: actions a second.
     """
@@ -116,7 +118,7 @@ class Contract:
     robot: str
     step: int
     spec: AlignSpec
-    focal: float
+    K: tuple[tuple[float, float, float], ...]
     frame: tuple[int, int]
     rendered: bool
     distance: float
@@ -125,10 +127,9 @@ class Contract:
 
     def reference(self, zoom: float = 1.0) -> Camera:
         """The training's camera, its pose left open; with `zoom` times the focal length."""
-        height, width = self.frame
-        focal = zoom * self.focal
-        intrinsics = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
-        return Camera(np.asarray(intrinsics, np.float32), np.eye(4), height, width)
+        intrinsics = np.asarray(self.K, np.float32)
+        intrinsics[:2, :2] *= zoom
+        return Camera(intrinsics, np.eye(4), *self.frame)
 
 
 def contract_of(config: Config, step: int) -> Contract:
@@ -141,6 +142,8 @@ def contract_of(config: Config, step: int) -> Contract:
     spec = method.spec(TASKS[config.task], config.image_size)
     if method.frame == WIDE_FRAME:
         spec = dataclasses.replace(spec, border="edge")
+    focal = PAPER_FRAME / 2 / math.tan(math.radians(CAMERA_FOVY / 2))
+    middle = method.frame / 2
     apart = np.asarray(front_camera())[:3, 3] - np.asarray(WORKSPACE_CENTRE)
     return Contract(
         method=method.name,
@@ -148,12 +151,38 @@ def contract_of(config: Config, step: int) -> Contract:
         robot=config.robot,
         step=step,
         spec=spec,
-        focal=PAPER_FRAME / 2 / math.tan(math.radians(CAMERA_FOVY / 2)),
+        K=((focal, 0.0, middle), (0.0, focal, middle), (0.0, 0.0, 1.0)),
         frame=(method.frame, method.frame),
         rendered=True,
         distance=float(np.linalg.norm(apart)),
         heights=None,
         rate=CONTROL_RATE,
+    )
+
+
+def contract_of_recorded(values: Mapping[str, Any], step: int) -> Contract:
+    """The contract of a run on recordings, but for its heights.
+
+    Args:
+      values: of the run's config.json, see `train.recorded`.
+      step: of the checkpoint.
+    """
+    spec: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in values["spec"].items()
+    }
+    height, width = values["frame"]
+    return Contract(
+        method=values["method"],
+        task=values["task"],
+        robot="",
+        step=step,
+        spec=AlignSpec(**spec),
+        K=tuple((float(row[0]), float(row[1]), float(row[2])) for row in values["K"]),
+        frame=(int(height), int(width)),
+        rendered=False,
+        distance=float(values["distance"]),
+        heights=None,
+        rate=float(values["rate"]),
     )
 
 
@@ -598,14 +627,20 @@ def load(
         raise PolicyError(f"image_size: expected rows and columns, got {image_size}")
     _check_one_run(folder)
     try:
-        config = workspace.stored_config(folder)
+        values = records.load_json(folder / "config.json")
         step, path = workspace.best_checkpoint(folder)
-        contract = contract_of(config, step)
+        config: Config | Recorded
+        if values.get("kind") == workspace.RECORDED:
+            config = workspace.config_in(folder, Recorded)
+            contract = contract_of_recorded(values, step)
+        else:
+            config = workspace.stored_config(folder)
+            contract = contract_of(config, step)
         learner = make_learner(
             config.learner(methods.find(config.method[0])), contract.spec.proprio_size, (VIEW,)
         )
         state = learner.policy_state(checkpoint.load(path, learner.abstract_state()))
-    except (ValueError, KeyError) as error:
+    except (ValueError, TypeError, KeyError) as error:
         raise PolicyError(f"{folder}: {error}") from error
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state)):
         raise PolicyError(f"{path}: the parameters are not finite; train again")

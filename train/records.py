@@ -26,6 +26,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from palm_jax.train.metrics import read_metrics, write_atomic
 
+HELD_OUT = "held_out.json"
+"""Of a run on recordings: figures on the episodes that were held out (`train.held_out`)."""
+
 
 class RecordError(ValueError):
     """A file of a run folder that cannot be used; the message says which and why."""

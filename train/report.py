@@ -30,6 +30,7 @@ from palm_jax.train.page import (
     CSS,
     damaged_media,
     esc,
+    held_out_table,
     listing,
     mean_table,
     picture,
@@ -201,6 +202,7 @@ def facts(runs: Sequence[Run]) -> dict[str, str]:
     wall = duration(sum(known)) + (" in all" if len(known) > 1 else "") if known else ""
     entries = {
         "task": _unique(paper.task_label(run.task) for run in runs if run.task),
+        "data": _unique(lookup(run.config.get("source"), "name") for run in runs),
         "methods": ", ".join(
             paper.method_label(m) for m in paper.ordered_methods(list({run.method for run in runs}))
         ),
@@ -294,8 +296,21 @@ def draw_notes(runs: Sequence[Run]) -> list[str]:
     ]
 
 
+_RECORDED_NOTES = (
+    "Episodes held out took no part in the training, but the checkpoint with the smallest loss on "
+    "them was chosen: expect slightly more on new ones.",
+    "The errors are those of single actions on recorded frames, not a rate of success: in a closed "
+    "loop small errors add up, and some do not matter. Compare methods by them with care, and "
+    "policies by trying them.",
+    "R² is 1 where an action's number is foretold exactly, 0 where its mean would do as well, less "
+    "where that would be better; – where it never varies.",
+)
+
+
 def footnotes(runs: Sequence[Run]) -> list[str]:
     """What a reader must know to weigh the numbers."""
+    if all(run.recorded for run in runs):
+        return list(_RECORDED_NOTES)
     notes = []
     scenes = sorted({entry["episodes"] for run in runs for entry in run.counts.values()})
     if scenes:
@@ -333,13 +348,16 @@ def footnotes(runs: Sequence[Run]) -> list[str]:
     return notes
 
 
+_SIMULATOR = (
+    "Simulator: MuJoCo MJX with scenes, robots and a ray caster written for this package; the "
+    "paper uses RLBench (CoppeliaSim, OpenGL). Exact object ranges of the paper are not public."
+)
+
+
 def differences(config: Mapping[str, Any]) -> list[str]:
     """Where this set-up departs from the paper's, as far as config.json tells."""
-    lines = [
-        "Simulator: MuJoCo MJX with scenes, robots and a ray caster written for this package; the "
-        "paper uses RLBench (CoppeliaSim, OpenGL). Exact object ranges of the paper are not "
-        "public.",
-    ]
+    recorded = config.get("kind") == "recorded"
+    lines = [] if recorded else [_SIMULATOR]
     width, demos, steps = (lookup(config, name) for name in ("width", "demos", "steps"))
     if isinstance(width, int):
         lines.append(
@@ -355,7 +373,7 @@ def differences(config: Mapping[str, Any]) -> list[str]:
             f"Training: {steps} steps; the paper trains for 600 epochs with batches of 64."
         )
     frame = lookup(config, "frame")
-    if frame is not None:
+    if frame is not None and not recorded:
         lines.append(
             f"Virtual camera frame: {frame}, at the paper's focal length. The paper's has 512 "
             "pixels, and near its border the crop window shifts, so that the TCP leaves its pixel."
@@ -367,7 +385,7 @@ def differences(config: Mapping[str, Any]) -> list[str]:
             "those reported; the paper reports the best of its top three."
         )
     labels = lookup(config, "labels")
-    if isinstance(labels, str):
+    if isinstance(labels, str) and not recorded:
         lines.append(f"Action labels: {labels}; the paper's are achieved next poses.")
     return lines
 
@@ -376,10 +394,20 @@ def _tables(methods: Mapping[str, list[Run]]) -> str:
     """Tiles and table of one task, and what has no numbers yet."""
     counts = {name: entry for name, runs in methods.items() if (entry := pooled(runs))}
     body = tiles(counts) + result_table(counts) if counts else ""
-    unevaluated = [paper.method_label(name) for name in methods if name not in counts]
+    recorded = {name: found for name, runs in methods.items() if (found := _held_out(runs))}
+    if recorded:
+        body += held_out_table(recorded)
+    unevaluated = [
+        paper.method_label(name) for name in methods if name not in {**counts, **recorded}
+    ]
     if unevaluated:
         body += f'<p class="note">Not evaluated yet: {esc(", ".join(unevaluated))}.</p>'
     return body
+
+
+def _held_out(runs: Sequence[Run]) -> dict[str, Any]:
+    """The figures of the first seed that has some: errors on few episodes are not pooled."""
+    return next((run.held_out for run in runs if "loss" in run.held_out), {})
 
 
 def _media(path: Path, runs: Sequence[Run]) -> tuple[list[Path], list[Path]]:
@@ -496,6 +524,7 @@ def build(path: Path, *, max_megabytes: float = 40.0) -> str:
 
 # Pictures that other parts of the package leave in figures/.
 _CAPTIONS = {
+    "inputs": "What each policy is trained with: frames from the first to the last of its data.",
     "gallery": "What each policy sees in each domain, at the start of the domain's first scene.",
 }
 
@@ -537,7 +566,10 @@ def _page(
     methods = paper.ordered_methods(list({run.method for run in runs}))
     title = " · ".join(names) if names else "Results"
     labels = [paper.method_label(name) for name in methods]
-    lead = f"{', '.join(labels)}: success in and out of the training distribution"
+    about = "success in and out of the training distribution"
+    if all(run.recorded for run in runs):
+        about = "trained on recordings, measured on episodes held out"
+    lead = f"{', '.join(labels)}: {about}"
     warning = ""
     if problems:
         warning = (

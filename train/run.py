@@ -3,21 +3,17 @@
 import dataclasses
 import os
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 from rich.console import Console
 
-from palm_jax.align import procedural_bank
 from palm_jax.envs import physics, shifts
 from palm_jax.envs.rollout import Runner
+from palm_jax.train import console as terminal
 from palm_jax.train import (
-    checkpoint,
-    debug,
     demos,
     devices,
     figures,
@@ -26,31 +22,23 @@ from palm_jax.train import (
     learner,
     locks,
     methods,
-    pictures,
     records,
     report,
     sweep,
+    training,
     transforms,
     videos,
     workspace,
 )
-from palm_jax.train import console as terminal
-from palm_jax.train.config import Config, command, default_out
+from palm_jax.train.config import Config, default_out
 from palm_jax.train.evaluate import VIEW, Evaluator, Runners, evaluate, quoted, turned
-from palm_jax.train.metrics import MetricsLog, write_json
+from palm_jax.train.metrics import write_json
 
 _FILMED = ("workspace+viewpoint", "workspace+viewpoint+embodiment")
 """Domains of which videos are made, where they are evaluated."""
 
-_PROMISE = "Stopping after this update, which saves; once more ends at once."
-_LOG_EVERY = 25  # updates
-_BANK = 128  # background textures for Random Overlay
 _TRANSFORM_KEY = 1 << 20  # apart from the keys of the demonstrations
 _SELECTION_SEED = 500  # scenes that score checkpoints: never those of the evaluation
-
-
-class Interrupted(KeyboardInterrupt):
-    """Stopped on request, with everything saved."""
 
 
 def execute(config: Config, console: Console) -> Path:
@@ -144,15 +132,15 @@ def _take_part(config: Config) -> None:
 
 
 def _share_training(config: Config, evaluator: Evaluator, data: learner.Batch) -> None:
-    stop = interrupts.Stop(_PROMISE)
+    stop = interrupts.Stop(training.PROMISE)
     together = devices.Together(stop)
     with stop.listening():
         learner.run(
             evaluator.learner,
             data,
             seed=config.seed,
-            bank=_backgrounds(config) if evaluator.method.augment else None,
-            log_every=_LOG_EVERY,
+            bank=training.backgrounds(config) if evaluator.method.augment else None,
+            log_every=training.LOG_EVERY,
             checkpoint_every=config.checkpoint_every,
             on_checkpoint=lambda step, state: devices.wait(),
             should_stop=together,
@@ -160,7 +148,7 @@ def _share_training(config: Config, evaluator: Evaluator, data: learner.Batch) -
             devices=jax.devices(),
         )
     if together.agreed:
-        raise Interrupted
+        raise training.Interrupted
 
 
 def _robots(config: Config) -> str:
@@ -179,17 +167,9 @@ def _note_environment(
     config: Config, folder: Path, wall_s: float, worlds: Mapping[str, int]
 ) -> None:
     path = folder / "env.json"
-    earlier = _noted(path).get("wall_s", 0.0)
+    earlier = training.noted(path).get("wall_s", 0.0)
     found = workspace.environment(config, wall_s=earlier + wall_s)
     write_json(path, {**found, "worlds": dict(worlds)})
-
-
-def _noted(path: Path) -> dict[str, Any]:
-    """What a file of notes holds, nothing if it is absent or damaged: no result rests on it."""
-    try:
-        return records.load_json(path)
-    except records.RecordError:
-        return {}
 
 
 def _demonstration_file(config: Config) -> Path:
@@ -244,8 +224,8 @@ def _one_method(
     if devices.from_first(_finished(folder, console)):
         console.print(f"{method.name}: trained and evaluated already")
         return
-    _train(config, evaluator, _samples(config, evaluator, data), folder, console)
-    with _timed(folder, "evaluation_s"):
+    _training(config, evaluator, folder).train(_samples(config, evaluator, data), console)
+    with training.timed(folder, "evaluation_s"):
         _evaluate(config, evaluator, folder, console)
 
 
@@ -282,112 +262,26 @@ def _finished(folder: Path, console: Console) -> bool:
     return True
 
 
-@contextmanager
-def _timed(folder: Path, what: str) -> Iterator[None]:
-    """Adds the seconds spent inside to times.json, which also counts over interruptions."""
-    start = time.monotonic()
-    try:
-        yield
-    finally:
-        path = folder / "times.json"
-        times = _noted(path)
-        times[what] = round(times.get(what, 0.0) + time.monotonic() - start, 2)
-        write_json(path, times)
+def _training(config: Config, evaluator: Evaluator, folder: Path) -> training.Training:
+    """Of a method; checkpoints are scored by their success in-domain."""
+    model = evaluator.learner
 
-
-def _train(
-    config: Config, evaluator: Evaluator, data: learner.Batch, folder: Path, console: Console
-) -> None:
-    """Trains from the newest valid checkpoint, or from the start, to the last step."""
-    model, store = evaluator.learner, folder / "checkpoints"
-    state, done = None, 0
-    belongs = workspace.fingerprint(config, evaluator.method.name)
-    found = checkpoint.latest_valid(store, fingerprint=belongs)
-    if found:
-        done, path = found
-        state = checkpoint.load(path, model.abstract_state())
-        if done < config.steps:
-            terminal.resumed(console, f"{evaluator.method.name}, step {done} of {config.steps}")
-        _score_if_missing(config, evaluator, path, done, state)
-    bank = _backgrounds(config) if evaluator.method.augment else None
-    dumped = debug.dumping(folder / debug.DUMPS, model)
-    stop = interrupts.Stop(_PROMISE)
-    together = devices.Together(stop)
-    with (
-        MetricsLog(folder / "metrics.jsonl", resume_step=done) as log,
-        terminal.ProgressBar(
-            console, config.steps, f"train {evaluator.method.name}", done=done
-        ) as bar,
-        stop.listening(),
-    ):
-        shown = done
-
-        def on_log(step: int, values: dict[str, float]) -> None:
-            nonlocal shown
-            log.write(step, values)
-            bar.advance(step - shown, loss=f"{values['loss']:.4f}")
-            shown = step
-
-        def on_checkpoint(step: int, state: learner.TrainState) -> None:
-            meta = {
-                "method": evaluator.method.name,
-                "task": config.task,
-                checkpoint.FINGERPRINT: belongs,
-            }
-            path = checkpoint.save(store, step, state, meta, keep=config.keep)
-            if not stop():
-                score = _score_if_missing(config, evaluator, path, step, state)
-                if score is not None:
-                    log.write(step, {"in_domain_success": score})
-            devices.wait()
-
-        def on_failure(failure: learner.Failure) -> None:
-            dump(failure)
-            devices.wait()
-
-        with _timed(folder, "training_and_selection_s"), dumped as dump:
-            learner.run(
-                model,
-                data,
-                seed=config.seed,
-                state=state,
-                bank=bank,
-                log_every=_LOG_EVERY,
-                on_log=on_log,
-                checkpoint_every=config.checkpoint_every,
-                on_checkpoint=on_checkpoint,
-                should_stop=together,
-                on_failure=on_failure,
-                devices=jax.devices(),
-            )
-    if together.agreed:
-        raise Interrupted
-
-
-def _score_if_missing(
-    config: Config, evaluator: Evaluator, path: Path, step: int, state: learner.TrainState
-) -> float | None:
-    """In-domain success of a checkpoint, written into its meta data; None if not scored."""
-    if step < config.select_from * config.steps or checkpoint.SCORE in checkpoint.read_meta(path):
-        return None
-    with _timed(path.parents[1], "selection_s"):
+    def score(step: int, state: learner.TrainState) -> training.Score | None:
+        if step < config.select_from * config.steps:
+            return None
         found = evaluator.domain(
-            evaluator.learner.policy_state(state),
+            model.policy_state(state),
             "in_domain",
             seed=_SELECTION_SEED,
             count=config.select_scenes,
             aligned=False,
         )
-    score = float(found.solved.mean())
-    checkpoint.update_meta(path, **{checkpoint.SCORE: score})
-    return score
+        success = float(found.solved.mean())
+        return training.Score(success, {"in_domain_success": success})
 
-
-def _backgrounds(config: Config) -> jax.Array:
-    """Pictures [K, H, W, 3] for Random Overlay: the user's own, or textures made in jit."""
-    if config.backgrounds is not None:
-        return jax.numpy.asarray(pictures.read_folder(config.backgrounds, config.image_size))
-    return procedural_bank(jax.random.key(config.seed), _BANK, config.image_size)
+    name = evaluator.method.name
+    belongs = workspace.fingerprint(config, name)
+    return training.Training(config, name, model, folder, belongs, score, evaluator.method.augment)
 
 
 def _evaluate(config: Config, evaluator: Evaluator, folder: Path, console: Console) -> None:
@@ -514,9 +408,3 @@ def _gallery(folders: dict[str, Path], out: Path, console: Console) -> None:
 
 def _views(views: Mapping[str, np.ndarray], kind: str) -> dict[str, np.ndarray]:
     return {name.removeprefix(kind): views[name] for name in views if name.startswith(kind)}
-
-
-def resume_command(config: Config) -> list[str]:
-    """The command line that goes on with a run."""
-    out = config.out or default_out(config)
-    return command(dataclasses.replace(config, out=out), resume=True)

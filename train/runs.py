@@ -29,12 +29,18 @@ class Run:
     )  # by robot and shift
     quoted: str = ""  # which variant of the hand's initial yaw `counts` are of
     variants: dict[str, Counts] = field(default_factory=dict)
+    held_out: dict[str, Any] = field(default_factory=dict)  # of a run on recordings
     metrics: list[dict[str, Any]] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
 
     @property
     def method(self) -> str:
         return str(self.config.get("method") or self.path.name)
+
+    @property
+    def recorded(self) -> bool:
+        """Trained on recordings: there is no simulator to be evaluated in."""
+        return self.config.get("kind") == "recorded"
 
     @property
     def task(self) -> str:
@@ -79,6 +85,7 @@ def load_run(path: Path) -> Run:
     for file in sorted(path.glob("strength-*.npz")):
         if (strengths := read(file.name, records.load_strengths, None)) is not None:
             run.strengths[records.swept_robot(file), strengths.shift] = strengths
+    run.held_out = read(records.HELD_OUT, records.load_json, {})
     run.metrics, complaints = read("metrics.jsonl", records.load_metrics, ([], []))
     run.problems += complaints
     if not run.counts and run.episodes:

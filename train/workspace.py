@@ -8,16 +8,18 @@ import os
 import platform
 import shlex
 import subprocess
+import tempfile
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import jax
 
 from palm_jax.envs import shifts
 from palm_jax.envs.registry import TASKS
 from palm_jax.train import checkpoint, methods, records
-from palm_jax.train.config import Config, ConfigError, command
+from palm_jax.train.config import AnyConfig, Config, ConfigError, Learning, command
 from palm_jax.train.evaluate import VIEW, Evaluator, Runners
 from palm_jax.train.learner import Learner, PolicyState, make_learner
 from palm_jax.train.metrics import write_json
@@ -33,20 +35,20 @@ _PACKAGES = (
     "mujoco-mjx",
     "numpy",
 )
-_FREE = ("out", "resume", "data", "sweep", "videos", "method")
+_FREE = ("out", "resume", "data", "calibration", "sweep", "videos", "method")
 """Fields in which a resumed command may differ from the one that began."""
+
+RECORDED = "recorded"
+"""What config.json says under "kind" of a run on recordings; nothing of one in the simulator."""
 
 _NOT_STORED = ("distributed",)
 """Fields of the machines alone: no run folder holds them."""
 
 
-def _stored_fields() -> list[str]:
-    return [f.name for f in dataclasses.fields(Config) if f.name not in _NOT_STORED]
-
-
 def stored(config: Config, method: str) -> dict[str, Any]:
     """What `config.json` of one method's run folder holds."""
-    values = {name: getattr(config, name) for name in _stored_fields()}
+    names = [f.name for f in dataclasses.fields(Config) if f.name not in _NOT_STORED]
+    values = {name: getattr(config, name) for name in names}
     low, high = shifts.TEST_LOW, shifts.TEST_HIGH
     regions = {
         "train_x": (0.15, 0.35),
@@ -66,12 +68,22 @@ def stored(config: Config, method: str) -> dict[str, Any]:
 
 
 def begin(config: Config, folder: Path, method: str) -> None:
+    """`begin_run` for a run in the simulator."""
+    begin_run(stored(config, method), folder, resume=config.resume)
+
+
+def begin_run(values: Mapping[str, Any], folder: Path, *, resume: bool) -> None:
     """Writes `config.json`; on a resume checks that it says the same.
+
+    Args:
+      values: see `stored`.
+      folder: of the run.
+      resume: whether to go on with a run that is there.
 
     Raises:
       ConfigError: the folder holds another run, or holds one and `resume` was not asked for.
     """
-    path, fresh = folder / "config.json", stored(config, method)
+    path, fresh = folder / "config.json", json.loads(json.dumps(values, default=str))
     if path.exists():
         try:
             old = records.load_json(path)
@@ -80,29 +92,32 @@ def begin(config: Config, folder: Path, method: str) -> None:
                 f"{error}: move it away and call again with the options that the run began with; "
                 "checkpoints of other options are not used"
             ) from error
-        if not config.resume:
+        if not resume:
             raise ConfigError(
                 f"{folder} holds a run already: add --resume to go on, or choose another --out"
             )
-        now = json.loads(json.dumps(fresh, default=str))
-        for name in sorted(set(old) | set(now)):
-            if name not in _FREE and old.get(name) != now.get(name):
+        for name in sorted(set(old) | set(fresh)):
+            if name not in _FREE and old.get(name) != fresh.get(name):
                 raise ConfigError(
                     f"{folder} was begun with {name} = {old.get(name)!r}, but now {name} = "
-                    f"{now.get(name)!r}: resume with the old value, or choose another --out"
+                    f"{fresh.get(name)!r}: resume with the old value, or choose another --out"
                 )
-    write_json(path, json.loads(json.dumps(fresh, default=str)))
+    write_json(path, fresh)
 
 
 def fingerprint(config: Config, method: str) -> str:
     """Of all options that a run must keep: what its checkpoints are told by from others'."""
-    values = stored(config, method)
+    return fingerprint_of(stored(config, method))
+
+
+def fingerprint_of(values: Mapping[str, Any]) -> str:
+    """`fingerprint` of what `config.json` holds."""
     kept = {name: value for name, value in values.items() if name not in _FREE}
-    text = json.dumps({**kept, "method": method}, default=str, sort_keys=True)
+    text = json.dumps({**kept, "method": values["method"]}, default=str, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def environment(config: Config, *, wall_s: float) -> dict[str, Any]:
+def environment(config: Learning, *, wall_s: float) -> dict[str, Any]:
     """What `env.json` holds: where, when and with what."""
     return {
         "command": shlex.join(command(config)),
@@ -155,19 +170,51 @@ def _commit() -> str | None:
     return found.stdout.strip()
 
 
+def nameless_file(folder: Path, size: int) -> IO[bytes]:
+    """A file of `size` bytes in a folder that has no name: it ends with the process.
+
+    Raises:
+      OSError: no room for it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    file = tempfile.TemporaryFile(dir=folder)
+    try:
+        # Space is taken now: a mapped page without any would end the process when it is written.
+        os.posix_fallocate(file.fileno(), 0, size)
+    except OSError:
+        file.close()
+        raise
+    return file
+
+
 def stored_config(folder: Path) -> Config:
-    """The configuration of a run folder, as the command saw it."""
+    """The configuration of a run folder, as the command saw it.
+
+    Raises:
+      ConfigError: it is that of a run on recordings, which nothing can simulate.
+    """
+    if records.load_json(folder / "config.json").get("kind") == RECORDED:
+        raise ConfigError(
+            f"{folder}: a policy trained on recordings: expected one of the simulator; it can be "
+            "loaded with palm_jax.policy.load and served, but not evaluated here"
+        )
+    return config_in(folder, Config)
+
+
+def config_in(folder: Path, kind: type[AnyConfig]) -> AnyConfig:
+    """What `config.json` holds, as the command saw it."""
     values = records.load_json(folder / "config.json")
-    names = _stored_fields()
+    names = [f.name for f in dataclasses.fields(kind) if f.name not in _NOT_STORED]
     missing = sorted(set(names) - set(values))
     if missing:
         raise ConfigError(f"{folder}/config.json lacks {', '.join(missing)}: another version's run")
     chosen = {name: values[name] for name in names}
-    for name in ("out", "data", "backgrounds"):
-        chosen[name] = None if chosen[name] is None else Path(chosen[name])
-    chosen["method"] = (chosen["method"],)
-    chosen["domains"] = tuple(chosen["domains"])
-    return Config(**chosen)
+    for name in ("out", "data", "backgrounds", "calibration"):
+        if chosen.get(name) is not None:
+            chosen[name] = Path(chosen[name])
+    chosen = {name: tuple(v) if isinstance(v, list) else v for name, v in chosen.items()}
+    chosen["method"] = (values["method"],)
+    return kind(**chosen)
 
 
 def make_evaluator(config: Config, method: methods.Method, runners: Runners) -> Evaluator:

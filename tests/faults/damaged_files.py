@@ -21,7 +21,17 @@ from rich.console import Console
 
 from palm_jax.envs import make
 from palm_jax.envs.base import EnvParams
-from palm_jax.train import checkpoint, demos, metrics, records, run, runs, table, workspace
+from palm_jax.train import (
+    checkpoint,
+    demos,
+    metrics,
+    records,
+    run,
+    runs,
+    table,
+    training,
+    workspace,
+)
 from palm_jax.train.config import Config, ConfigError
 
 # -- checkpoints -----------------------------------------------------------------------------------
@@ -312,7 +322,7 @@ def _damaged_line(folder: Path) -> Outcome:
 @case("results", "times.json and env.json are damaged")
 def _damaged_notes(folder: Path) -> Outcome:
     (folder / "times.json").write_text("{")
-    with run._timed(folder, "evaluation_s"):
+    with training.timed(folder, "evaluation_s"):
         pass
     assert set(records.load_json(folder / "times.json")) == {"evaluation_s"}
     return Outcome("begun anew: no result rests on them", "timings")

@@ -71,7 +71,8 @@ def test_the_contract_is_the_runs(policy: Policy) -> None:
     assert (contract.method, contract.task, contract.robot) == ("palm", "lift_lid", "panda")
     assert (contract.spec.crop, contract.spec.size, contract.spec.layout) == (160, 32, "cam6d_z")
     # 40 degrees over 512 pixels: half of them over the tangent of half of it.
-    assert contract.focal == pytest.approx(256 / 0.36397023)
+    focal = 256 / 0.36397023
+    np.testing.assert_allclose(contract.K, [[focal, 0, 512], [0, focal, 512], [0, 0, 1]])
     assert contract.heights == pytest.approx(tiny.HEIGHTS)
     # RLBench's front camera and the middle of the table.
     assert contract.distance == pytest.approx(np.hypot(1.35 - 0.25, 1.58 - 0.752))

@@ -261,6 +261,25 @@ class RobomimicSource(Source):
     def task(self, episode: str) -> str:
         return str(self.env_args.get("env_name", "unknown"))
 
+    def split(self) -> tuple[list[str], list[str]] | None:
+        """Robomimic's filter keys train and valid, as far as they name episodes that are there.
+
+        Raises:
+          FormatError: an episode in both.
+        """
+        mask = self.file.get("mask")
+        if not isinstance(mask, h5py.Group) or not {"train", "valid"} <= set(mask):
+            return None
+        named = [{str(name, "utf-8") for name in mask[key][()]} for key in ("train", "valid")]
+        both = sorted(named[0] & named[1], key=by_number)
+        if both:
+            raise FormatError(
+                f"{self.path}: the filter keys train and valid both name {both[0]}; expected "
+                "different episodes: mend them, or pass --validation SHARE"
+            )
+        train, valid = ([name for name in self.episodes if name in names] for names in named)
+        return (train, valid) if train and valid else None
+
     def close(self) -> None:
         if self._pool is not None:
             self._pool.shutdown()

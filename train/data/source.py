@@ -89,6 +89,10 @@ class Source(abc.ABC):
         """What is done in the episode, in words."""
         return "unknown"
 
+    def split(self) -> tuple[list[str], list[str]] | None:
+        """Episodes for training and for validation, where the file itself says so."""
+        return None
+
     @abc.abstractmethod
     def close(self) -> None:
         """Let go of the file."""
