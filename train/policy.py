@@ -14,9 +14,10 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
+import sys
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,8 +38,10 @@ from palm_jax.align import (
     ShapeError,
     align_like,
     apply_delta,
+    undistort,
 )
 from palm_jax.align.camera import check_tcp_in_view
+from palm_jax.align.lens import LENGTHS
 from palm_jax.align.proprio import LAYOUTS
 from palm_jax.envs.base import (
     CAMERA_FOVY,
@@ -258,8 +261,10 @@ class Policy:
         zoom: float = 1.0,
         off_centre: float = _OFF_CENTRE,
         noise_seed: int | None = None,
+        dist: tuple[float, ...] | None = None,
     ) -> None:
         """See `load`, which checks what is given here."""
+        self._dist = dist
         self.contract, self.zoom = contract, zoom
         self._learner, self.state, self._off_centre = learner, state, off_centre
         self._noise = None if noise_seed is None else jax.random.key(noise_seed)
@@ -297,8 +302,8 @@ class Policy:
         """The next target of the TCP, to be reached within 1 / `contract.rate` seconds.
 
         Args:
-          image: uint8 [H, W, 3], RGB, the camera's whole image, lens distortion removed. The first
-            image of another size than `load` was told of takes seconds.
+          image: uint8 [H, W, 3], RGB, the camera's whole image, upright; lens distortion removed, if
+            `load` was not told of it. The first of another size than `load` knows takes seconds.
           K: [3, 3] intrinsics in pixels of this image.
           cam_to_world: [4, 4] pose of the camera, OpenCV axes (x right, y down, z forward).
           tcp: [4, 4] pose of the TCP (z the direction of approach, y the opening axis), in the same
@@ -427,6 +432,8 @@ class Policy:
         opening: jax.Array,
         mask: jax.Array | None,
     ) -> tuple[Aligned, jax.Array]:
+        if self._dist is not None:
+            image = undistort(image, K, np.asarray(self._dist, np.float32))
         return align_like(
             image,
             Camera(K, cam_to_world, *image.shape[:2]),
@@ -598,6 +605,7 @@ def load(
     zoom: float = 1.0,
     off_centre: float = _OFF_CENTRE,
     noise_seed: int | None = None,
+    dist: Sequence[float] | None = None,
 ) -> Policy:
     """The policy of a finished run, ready to act: its best checkpoint by in-domain success, with
     the averaged parameters, as in the run's own evaluation.
@@ -613,6 +621,10 @@ def load(
         size; a K of another image size is found out by it.
       noise_seed: add the noise on proprioception that evaluations add, drawn from this seed; None
         for none, and equal actions for equal inputs.
+      dist: lens coefficients of the camera (OpenCV's 4, 5 or 8), to give `act` its images as they
+        are; they are undistorted in the same compiled call. None for images without distortion.
+
+    Prints how long an action takes, to standard error, if it compiles here.
 
     Raises:
       PolicyError: no run, several runs, no whole and scored checkpoint, parameters that are not
@@ -625,6 +637,10 @@ def load(
         raise PolicyError(f"off_centre: expected a share of the image, got {off_centre}")
     if image_size is not None and min(image_size) < 1:
         raise PolicyError(f"image_size: expected rows and columns, got {image_size}")
+    if dist is not None and (len(dist) not in LENGTHS or not np.isfinite(dist).all()):
+        raise PolicyError(
+            f"dist: expected {', '.join(map(str, LENGTHS))} finite lens coefficients, got {dist}"
+        )
     _check_one_run(folder)
     try:
         values = records.load_json(folder / "config.json")
@@ -646,11 +662,20 @@ def load(
         raise PolicyError(f"{path}: the parameters are not finite; train again")
     contract = dataclasses.replace(contract, heights=_heights(contract.spec, state))
     policy = Policy(
-        learner, state, contract, zoom=zoom, off_centre=off_centre, noise_seed=noise_seed
+        learner,
+        state,
+        contract,
+        zoom=zoom,
+        off_centre=off_centre,
+        noise_seed=noise_seed,
+        dist=None if dist is None else tuple(map(float, dist)),
     )
     if image_size is not None:
         took = policy.warm_up(*image_size)
-        _log.info("%s: %.1f ms an action for images of %d x %d", folder, took, *image_size)
+        height, width = image_size
+        print(
+            f"{folder}: {took:.1f} ms an action for images of {height} x {width}", file=sys.stderr
+        )
     return policy
 
 
