@@ -302,8 +302,8 @@ class Policy:
         """The next target of the TCP, to be reached within 1 / `contract.rate` seconds.
 
         Args:
-          image: uint8 [H, W, 3], RGB, the camera's whole image, upright; lens distortion removed, if
-            `load` was not told of it. The first of another size than `load` knows takes seconds.
+          image: uint8 [H, W, 3], RGB, the camera's whole image, upright; lens distortion removed
+            unless `load` was told of it. The first of another size than `load` knows takes seconds.
           K: [3, 3] intrinsics in pixels of this image.
           cam_to_world: [4, 4] pose of the camera, OpenCV axes (x right, y down, z forward).
           tcp: [4, 4] pose of the TCP (z the direction of approach, y the opening axis), in the same
