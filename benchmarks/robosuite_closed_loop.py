@@ -97,7 +97,7 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--steps", type=int, default=120, help="control steps of an episode")
     parser.add_argument("--turn", type=float, default=0.0, help="degrees of the camera")
-    parser.add_argument("--gain", type=float, default=1.5, help="command over covered motion")
+    parser.add_argument("--gain", type=float, default=4.0, help="command over covered motion")
     parser.add_argument("--port", type=int, default=8000)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
