@@ -450,6 +450,27 @@ def test_the_other_orientation_that_robosuite_writes() -> None:
     np.testing.assert_allclose(got, expected, atol=1e-3)
 
 
+@pytest.mark.parametrize(("closed", "opened"), [(1.0, -1.0), (-1.0, 1.0), (-0.04, 0.0)])
+def test_a_single_gripper_value_keeps_its_sign(
+    closed: float, opened: float, tmp_path: Path
+) -> None:
+    """robosuite's, LIBERO's and Bridge's command is -1 open, 1 closed; only of several fingers,
+    which mirror each other, is the sign nothing."""
+    share = np.linspace(0, 1, 15)
+
+    def add(file: h5py.File) -> None:
+        values = (closed + share * (opened - closed))[:, None]
+        file["data/demo_0/obs/grip"] = values
+        file["data/demo_0/obs/fingers"] = np.concatenate([share, -share]).reshape(2, 15).T
+
+    path = datasets.changed(datasets.LIFT, tmp_path, add)
+    for key, ends in (("grip", (closed, opened)), ("fingers", (0.0, 1.0))):
+        told = datasets.robosuite(path, opening=key, closed=ends[0], open=ends[1])
+        with open_recording(path, told) as recording:
+            got = recording.trajectory("demo_0").opening
+        np.testing.assert_allclose(got, share, atol=1e-12)
+
+
 def test_sources_name_their_keys_and_columns() -> None:
     with open_source(datasets.LIFT) as source:
         assert source.resolve("robot0_eef_pos") == "obs/robot0_eef_pos"

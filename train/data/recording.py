@@ -69,6 +69,12 @@ class Survey:
     worst_share: float
 
 
+def gripper_values(numbers: np.ndarray) -> np.ndarray:
+    """[T] one number a frame of a gripper's columns [T, n]: itself, or the mean absolute value of
+    several fingers, which move with opposite signs."""
+    return numbers[:, 0] if numbers.shape[1] == 1 else np.abs(numbers).mean(1)
+
+
 def projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """uv [T, 2] (NaN behind the camera) and depth [T] of points [T, 3] in the base's frame.
 
@@ -160,7 +166,7 @@ class Recording:
     def _opening(self, gripper: np.ndarray) -> np.ndarray:
         closed, opened = self.keys.closed, self.keys.open
         assert closed is not None and opened is not None
-        return np.clip((np.abs(gripper).mean(1) - closed) / (opened - closed), 0.0, 1.0)
+        return np.clip((gripper_values(gripper) - closed) / (opened - closed), 0.0, 1.0)
 
     def survey(self, episodes: Iterable[str] | None = None) -> Survey:
         """Reads every pose and tells where the TCP appears.
@@ -325,10 +331,11 @@ def _gripper(source: Source, given: RobotKeys) -> tuple[str, float, float]:
     opened = given.open if given.open is not None else opened
     told = given.closed is not None and given.open is not None
     if closed is None or opened is None or (columns.shape[1] != count and not told):
-        size = np.abs(columns).mean(1)
+        size = gripper_values(columns)
+        several = f"Its {columns.shape[1]} columns have a mean absolute value"
         raise OpeningError(
-            f"{source.path}: what is {opening} when the gripper is closed, and what when open? Its "
-            f"{columns.shape[1]} columns have a mean absolute value from {size.min():.4g} to "
+            f"{source.path}: what is {opening} when the gripper is closed, and what when open? "
+            f"{several if columns.shape[1] > 1 else 'It goes'} from {size.min():.4g} to "
             f"{size.max():.4g} in the first episode. Write it into the calibration: "
             "`data calibrate ... --opening KEY --closed VALUE --open VALUE`"
         )
