@@ -14,10 +14,11 @@ import oracles
 import pytest
 from scipy.spatial.transform import Rotation
 
+from palm_jax.__main__ import main
 from palm_jax.align import AlignSpec
 from palm_jax.train import data
 from palm_jax.train.data import aligning, job, output, robomimic_writer, soundness
-from palm_jax.train.data.errors import DataError, OutputError, TruncatedError
+from palm_jax.train.data.errors import CalibrationError, DataError, OutputError, TruncatedError
 from palm_jax.train.data.job import Options
 from palm_jax.train.data.recording import Recording, open_recording
 
@@ -531,11 +532,11 @@ def test_repair_leaves_the_unsound_out(tmp_path: Path) -> None:
     result = data.repair(path, tmp_path / "new.hdf5")
     assert result.kept == ("demo_1",) and "NaN" in result.dropped["demo_0"]
     assert data.verify(tmp_path / "new.hdf5") == {} and datasets.digest(path) == before
-    original, saved = arrays(datasets.LIFT, "demo_1"), arrays(tmp_path / "new.hdf5")
+    original, saved = (arrays(p, "demo_1") for p in (datasets.LIFT, tmp_path / "new.hdf5"))
     for key, value in original.items():
         np.testing.assert_array_equal(saved[key], value)
     with h5py.File(tmp_path / "new.hdf5") as file:
-        assert list(file["mask/valid"][()]) == [b"demo_0"]
+        assert list(file["mask/valid"][()]) == [b"demo_1"] and list(file["data"]) == ["demo_1"]
         assert file["data"].attrs["total"] == 18
         assert json.loads(file["data"].attrs["palm_repair"])["dropped"]["demo_0"]
 
@@ -563,8 +564,8 @@ def test_repair_of_a_cut_file_takes_nothing_for_zeros(
         assert not (tmp_path / "saved.hdf5").exists()
         return
     assert data.verify(tmp_path / "saved.hdf5") == {}
-    for number, name in enumerate(result.kept):
-        saved = arrays(tmp_path / "saved.hdf5", f"demo_{number}")
+    for name in result.kept:
+        saved = arrays(tmp_path / "saved.hdf5", name)
         for key, value in arrays(datasets.LIFT, name).items():
             np.testing.assert_array_equal(saved[key], value, err_msg=key)
 
@@ -587,6 +588,13 @@ def test_repair_of_lerobot(tmp_path: Path) -> None:
     assert "15 images, expected 18" in data.verify(root, robot=robot)["1"][0]
     result = data.repair(root, tmp_path / "saved", robot=robot)
     assert result.kept == ("0",) and list(result.dropped) == ["1"]
+    told = datasets.lerobot_calibration()
+    front = told.cameras["front"]
+    front = dataclasses.replace(front, by_episode={"1": front.cam_to_base})
+    with open_recording(
+        tmp_path / "saved", dataclasses.replace(told, cameras={"front": front})
+    ) as recording:
+        assert recording.source.episodes == ("0",)  # the other is known to be gone
     assert data.verify(tmp_path / "saved", robot=robot) == {}
     before = table_of(root, "data/chunk-000/file-000.parquet")
     after = table_of(tmp_path / "saved", "data/chunk-000/file-000.parquet")
@@ -595,6 +603,85 @@ def test_repair_of_lerobot(tmp_path: Path) -> None:
         key = "observation.images.front"
         for got, expected in zip(saved.blocks("0", key, 8), old.blocks("0", key, 8), strict=True):
             np.testing.assert_array_equal(got, expected)
+
+
+# -- calibrations after a repair -------------------------------------------------------------------
+
+
+def raised(name: str) -> data.Calibration:
+    """The Lift calibration whose camera stood higher in one episode."""
+    found = datasets.robosuite()
+    camera = found.cameras["agentview"]
+    pose = camera.cam_to_base + oracles.pose(np.zeros((3, 3)), [0, 0, 0.3]) - np.diag([0, 0, 0, 1])
+    camera = dataclasses.replace(camera, by_episode={name: pose})
+    return dataclasses.replace(found, cameras={"agentview": camera})
+
+
+@pytest.mark.parametrize("spoiled", ["demo_0", "demo_1"])
+def test_the_calibration_of_before_is_that_of_the_repaired_file(
+    spoiled: str, tmp_path: Path
+) -> None:
+    """align, its error, repair, align: as docs/your_data.md says. Repaired twice."""
+
+    def spoil(file: h5py.File) -> None:
+        file[f"data/{spoiled}/obs/robot0_eef_pos"][3] = np.nan
+
+    path = datasets.changed(datasets.LIFT, tmp_path, spoil)
+    first, second = tmp_path / "first.hdf5", tmp_path / "second.hdf5"
+    data.repair(path, first)
+    data.repair(first, second)
+    (kept,) = {"demo_0", "demo_1"} - {spoiled}
+    for repaired in (first, second):
+        with open_recording(repaired, raised("demo_1")) as recording:
+            (episode,) = data.aligned_episodes(recording, SPEC)
+        assert episode.name == kept
+        height = camera()[1][2, 3] + (0.3 if kept == "demo_1" else 0)
+        assert episode.camera.cam_to_world[2, 3] == pytest.approx(height, abs=1e-6)
+
+
+def test_poses_of_episodes_that_there_are_not(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"by_episode: expected .* got traj_1.*demo_0, demo"):
+        open_recording(datasets.LIFT, raised("traj_1"))
+
+
+def test_lerobot_numbers_anew_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    root = datasets.lerobot(tmp_path)
+    table = root / "data/chunk-000/file-000.parquet"
+    columns = pq.read_table(table).to_pydict()
+    columns["observation.state"][2][0] = float("nan")  # of episode 0
+    pq.write_table(pa.table(columns), table)
+    told = datasets.lerobot_calibration()
+    front, pose = told.cameras["front"], raised("1").cameras["agentview"].by_episode["1"]
+    told = data.Calibration(
+        {"front": dataclasses.replace(front, by_episode={"0": pose, "1": pose})},
+        told.ee_to_tcp,
+        told.robot,
+    )
+    path = data.save_calibration(told, tmp_path / "c.json")
+    words = ["data", "repair", root, "--calibration", path, "--out", tmp_path / "new"]
+    assert main([str(word) for word in words]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "numbered anew: 1 is now 0 (all in" in out
+    assert "cameras.front.by_episode: 0 was left out" in out
+    assert "cameras.front.by_episode: 1 is now 0" in out
+    note = json.loads((tmp_path / "new/meta/palm.json").read_text())
+    assert note["episodes"] == {"1": "0"} and list(note["dropped"]) == ["0"]
+    with pytest.raises(CalibrationError, match="got 1, .*anew .1 is now 0.: give it the --cal"):
+        open_recording(tmp_path / "new", told)
+    with open_recording(tmp_path / "new", tmp_path / "new/meta/calibration.json") as recording:
+        assert list(recording.camera.by_episode) == ["0"]
+        np.testing.assert_allclose(recording.camera.camera("0").cam_to_world, pose, atol=1e-6)
+        (episode,) = data.aligned_episodes(recording, SPEC)
+    assert len(episode.images) == 18
+    assert main(["data", "repair", str(root), "--out", str(tmp_path / "again")]) == 0
+    assert (
+        "numbered anew" not in capsys.readouterr().out
+    )  # without it no pose is known, none is bad
 
 
 def test_nothing_to_repair(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from palm_jax.__main__ import main
 from palm_jax.train.data import calibration, output
 from palm_jax.train.data.errors import DiskFullError
+from palm_jax.train.metrics import plain
 
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
 Change = Callable[[h5py.File], None]
@@ -175,6 +176,10 @@ CASES: dict[str, Case] = {
         "TcpOutOfViewError", ["inverted", "--inverse"],
         calibrated={"T_base_cam": lambda: np.linalg.inv(pose())},
     ),
+    "a camera of episodes that are not there": Case(
+        "CalibrationError", ["by_episode", "got traj_3", "rename them; the file has demo_0"],
+        calibrated={"by_episode": lambda: {"traj_3": pose()}},
+    ),
     # Images.
     "images upside down": Case(
         "ImageOrientationError", ["upside down", "--flip ud", "--trust"],
@@ -285,7 +290,7 @@ def calibrated(folder: Path, entries: dict[str, Any]) -> Path:
     camera = content["cameras"].pop("agentview")
     content["cameras"][entries.get("name", "agentview")] = camera
     for key, value in entries.items():
-        value = np.asarray(value()).tolist() if callable(value) else value
+        value = plain(value()) if callable(value) else value
         if key in content["robot"]:
             content["robot"][key] = value
         elif key != "name":

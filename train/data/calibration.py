@@ -248,6 +248,21 @@ class Calibration:
             'the key of its images as "image"'
         )
 
+    def renumbered(self, numbers: Mapping[str, str]) -> Calibration:
+        """The same for a file whose episodes have other names.
+
+        Args:
+          numbers: old name -> new name of the episodes that are still there.
+        """
+
+        def moved(camera: CameraCalibration) -> CameraCalibration:
+            poses = camera.by_episode.items()
+            kept = {numbers[name]: pose for name, pose in poses if name in numbers}
+            return dataclasses.replace(camera, by_episode=kept)
+
+        cameras = {name: moved(camera) for name, camera in self.cameras.items()}
+        return dataclasses.replace(self, cameras=cameras)
+
     def to_json(self) -> dict[str, Any]:
         """The content of the file."""
         cameras = {

@@ -553,11 +553,39 @@ class Repair:
 
 
 def run_repair(config: Repair, console: Console) -> int:
-    result = soundness.repair(config.file, config.out, robot=_robot(config.calibration))
+    calibration = None if config.calibration is None else calib.load(config.calibration)
+    robot = None if calibration is None else calibration.robot
+    result = soundness.repair(config.file, config.out, robot=robot)
     for name, reason in result.dropped.items():
         console.print(f"left out {name}: {reason}", markup=False)
     console.print(f"{len(result.kept)} episodes written: {result.path}", markup=False)
+    if any(old != new for old, new in result.numbers.items()):
+        _follow_numbers(result, calibration, console)
     return 0
+
+
+def _follow_numbers(
+    result: soundness.Repair, calibration: Calibration | None, console: Console
+) -> None:
+    """Says how LeRobot's episodes are numbered anew, and lets the calibration follow."""
+    numbers, meta = result.numbers, result.path / "meta"
+    pairs = [f"{old} is now {new}" for old, new in numbers.items() if old != new]
+    told = ", ".join(pairs[:3]) + (", ..." if len(pairs) > 3 else "")
+    console.print(f"episodes are numbered anew: {told} (all in {meta / 'palm.json'})", markup=False)
+    if calibration is None:
+        console.print(
+            "a calibration with poses by_episode must follow: repeat with --calibration C",
+            markup=False,
+        )
+        return
+    for camera in calibration.cameras.values():
+        for name in camera.by_episode:
+            now = f"is now {numbers[name]}" if name in numbers else "was left out"
+            console.print(f"cameras.{camera.name}.by_episode: {name} {now}", markup=False)
+    path = meta / "calibration.json"
+    with disk_full(path, "the episodes are written, their calibration is not"):
+        calib.save(calibration.renumbered(numbers), path)
+    console.print(f"written: {path}, for the new numbers", markup=False)
 
 
 def _robot(calibration: Path | None) -> RobotKeys | None:

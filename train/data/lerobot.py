@@ -180,6 +180,22 @@ class LeRobotSource(Source):
         names = self._rows[episode].get("tasks") or list(self._tasks.values())
         return str(names[0]) if names else "unknown"
 
+    def _repaired(self, entry: str) -> dict[str, Any]:
+        """What `data repair` has noted; empty in other sets."""
+        try:
+            return dict(self._json("meta/palm.json")[entry])
+        except (FormatError, ValueError, TypeError, LookupError):
+            return {}
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        return frozenset(self._repaired("dropped"))
+
+    @property
+    def numbered_anew(self) -> dict[str, str]:
+        numbers = self._repaired("episodes")
+        return {old: str(new) for old, new in numbers.items() if old != new}
+
     def close(self) -> None:
         pass
 

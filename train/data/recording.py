@@ -6,7 +6,7 @@ Nothing here reads images; a whole file is surveyed in seconds before the first 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -16,8 +16,9 @@ from palm_jax._checks import PoseError, check_pose
 from palm_jax.align import Camera
 from palm_jax.train.data import calibration as calib
 from palm_jax.train.data import rotations
-from palm_jax.train.data.calibration import Calibration, RobotKeys
+from palm_jax.train.data.calibration import Calibration, CameraCalibration, RobotKeys
 from palm_jax.train.data.errors import (
+    CalibrationError,
     EpisodeLengthError,
     EulerAmbiguityError,
     FormatError,
@@ -106,6 +107,7 @@ class Recording:
 
     Raises:
       CameraNameError, ImageSizeError: see `Calibration.find`, `CameraCalibration.upright`.
+      CalibrationError: the camera has poses of episodes that are not in the data.
       KeyMissingError, EulerAmbiguityError, OpeningError: the robot's keys are unknown.
     """
 
@@ -114,6 +116,7 @@ class Recording:
         self.camera, self.image_key = calibration.find(camera, source.image_keys)
         height, width, _ = source.features()[self.image_key].shape
         self.camera.upright(np.empty((0, height, width, 3), np.uint8))
+        _check_episodes(source, self.camera)
         self.keys = robot_keys(source, calibration.robot)
 
     def __enter__(self) -> Self:
@@ -190,6 +193,30 @@ class Recording:
             len(names), frames, seen / frames, behind / frames, tuple(uvs), names[worst],
             shares[worst],
         )  # fmt: skip
+
+
+def _check_episodes(source: Source, camera: CameraCalibration) -> None:
+    """Raises where a camera has poses of episodes that a file neither has nor had."""
+    known = {*source.episodes, *source.left_out}
+    lacking = [name for name in camera.by_episode if name not in known]
+    if not lacking:
+        return
+    anew = source.numbered_anew
+    advice = f"rename them; the file has {_some(source.episodes)}"
+    if anew:
+        moved = _some([f"{old} is now {new}" for old, new in anew.items()])
+        advice = (
+            f"`data repair` has numbered the episodes anew ({moved}): give it the --calibration, "
+            "and it writes one for the new file"
+        )
+    raise CalibrationError(
+        f"cameras.{camera.name}.by_episode: expected names of episodes in {source.path}, got "
+        f"{_some(lacking)}, whose poses would be left unused: {advice}"
+    )
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def _first_problem(poses: np.ndarray) -> str:

@@ -28,6 +28,9 @@ CACHE_BYTES = 64 * 2**20
 
 DEFAULT_FPS = 20.0
 
+REPAIR = "palm_repair"
+"""Attribute of `data` in a file that `data repair` has written: what it left out, as JSON."""
+
 
 def _inflater() -> Any:
     """`zlib`, or its faster twin."""
@@ -279,6 +282,13 @@ class RobomimicSource(Source):
             )
         train, valid = ([name for name in self.episodes if name in names] for names in named)
         return (train, valid) if train and valid else None
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        try:
+            return frozenset(json.loads(self.data.attrs.get(REPAIR, "{}"))["dropped"])
+        except (ValueError, TypeError, LookupError):
+            return frozenset()
 
     def close(self) -> None:
         if self._pool is not None:

@@ -25,7 +25,7 @@ from palm_jax.train.data.errors import (
 from palm_jax.train.data.lerobot import LeRobotSource
 from palm_jax.train.data.lerobot_writer import LeRobotWriter
 from palm_jax.train.data.recording import robot_keys
-from palm_jax.train.data.robomimic import RobomimicSource, by_number
+from palm_jax.train.data.robomimic import REPAIR, RobomimicSource
 from palm_jax.train.data.source import Source, fingerprint, open_source
 
 Problems = dict[str, list[str]]  # episode, or "" for the file -> what is wrong
@@ -146,13 +146,15 @@ class Repair:
     path: Path
     kept: tuple[str, ...]
     dropped: Mapping[str, str]  # episode -> why
+    numbers: Mapping[str, str]  # kept episode -> its name in the new file
 
 
 def repair(path: Path, out: Path, *, robot: RobotKeys | None = None) -> Repair:
-    """Copies the sound episodes of a file into a new one, numbered anew, with totals that are
-    right.
+    """Copies the sound episodes of a file into a new one, with totals that are right.
 
-    Works on HDF5 files that end too early: what lies beyond the end is not taken for zeros.
+    Works on HDF5 files that end too early: what lies beyond the end is not taken for zeros. Their
+    episodes keep their names, which a calibration may know; LeRobot demands numbers without gaps,
+    so those of a folder are numbered anew, and meta/palm.json says how.
 
     Args:
       path: file or folder; never touched.
@@ -179,7 +181,8 @@ def repair(path: Path, out: Path, *, robot: RobotKeys | None = None) -> Repair:
                 if not kept:
                     reasons = "; ".join(f"{n}: {r[0]}" for n, r in list(problems.items())[:3])
                     raise OutputError(f"{path}: no sound episode to save ({reasons})")
-                note = {"repaired": fingerprint(path, source.files()), "dropped": problems}
+                numbers = _numbers(source, kept)
+                note = _note(source, problems, numbers)
                 if isinstance(source, RobomimicSource):
                     _copy_hdf5(source, kept, partial, note)
                     output.publish(partial, out)
@@ -188,7 +191,24 @@ def repair(path: Path, out: Path, *, robot: RobotKeys | None = None) -> Repair:
         except BaseException:
             output.remove(partial)
             raise
-    return Repair(out, tuple(kept), {name: reasons[0] for name, reasons in problems.items()})
+    dropped = {name: reasons[0] for name, reasons in problems.items()}
+    return Repair(out, tuple(kept), dropped, numbers)
+
+
+def _numbers(source: Source, kept: list[str]) -> dict[str, str]:
+    """What the kept episodes are called in the new file."""
+    if isinstance(source, LeRobotSource):
+        return {name: str(index) for index, name in enumerate(kept)}
+    return {name: name for name in kept}
+
+
+def _note(source: Source, problems: Problems, numbers: Mapping[str, str]) -> dict[str, Any]:
+    """What the new file says of its making."""
+    note = {"repaired": fingerprint(source.path, source.files()), "dropped": problems}
+    if isinstance(source, LeRobotSource):
+        return note | {"episodes": dict(numbers)}
+    # Episodes keep their names, so what an earlier repair left out is still what it was.
+    return note | {"dropped": dict.fromkeys(source.left_out, ["left out before"]) | problems}
 
 
 def _unsound(source: Source, name: str, robot: RobotKeys) -> list[str]:
@@ -306,23 +326,15 @@ def _copy_hdf5(
         data = file.create_group("data")
         for key, value in source.data.attrs.items():
             data.attrs[key] = value
-        data.attrs["palm_repair"] = json.dumps(note)
+        data.attrs[REPAIR] = json.dumps(note)
         data.attrs["total"] = sum(source.length(name) for name in kept)
-        numbers = {}
-        for index, name in enumerate(sorted(kept, key=by_number)):
-            numbers[name] = f"demo_{index}"
-            source.file.copy(source.data[name], data, name=numbers[name])
-            data[numbers[name]].attrs["num_samples"] = source.length(name)
+        for name in kept:
+            source.file.copy(source.data[name], data, name=name)
+            data[name].attrs["num_samples"] = source.length(name)
         try:
-            _renamed_masks(source.file, file, numbers)
+            robomimic_writer.copy_masks(source.file, file, kept)
         except (OSError, RuntimeError, KeyError):
             pass  # beyond the end: filter keys can be made again
-
-
-def _renamed_masks(old: h5py.File, new: h5py.File, numbers: Mapping[str, str]) -> None:
-    for key, item in (old.get("mask") or {}).items():
-        names = [numbers[n] for raw in item[()] if (n := raw.decode()) in numbers]
-        new[f"mask/{key}"] = np.array(names, dtype="S")
 
 
 def _copy_lerobot(source: Source, kept: list[str], out: Path, note: dict[str, Any]) -> None:
