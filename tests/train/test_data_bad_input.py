@@ -201,6 +201,15 @@ CASES: dict[str, Case] = {
         "ImageSizeError", ["96 x 128", "got 128 x 96", "--flip cw or ccw"],
         change=images(lambda i: i[:, :96]), calibrated={"width": 96},
     ),
+    # Measured pixels.
+    "a camera that was moved": Case(
+        "ReprojectionError", ["within 3.0 px", "agentview_tcp_uv", "stood elsewhere", "--trust"],
+        calibrated={"T_base_cam": lambda: pose() @ oracles.pose(np.eye(3), [0.03, 0, 0])},
+    ),
+    "pixels that are none": Case(
+        "FormatError", ["expected 31 x 2 measured pixels", "got 3 x 2", "--pixels", "--trust"],
+        change=rows("obs/agentview_tcp_uv", 3),
+    ),
     # Poses.
     "angles without an order": Case(
         "EulerAmbiguityError",

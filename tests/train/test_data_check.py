@@ -14,11 +14,12 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from palm_jax.__main__ import main
-from palm_jax.train.data import aligning, calibration, check, commands, errors, motion
+from palm_jax.train.data import aligning, calibration, check, commands, errors, job, motion
 from palm_jax.train.data.calibration import Calibration
 from palm_jax.train.data.recording import Recording, open_recording
 
 SAMPLES = [datasets.LIFT, datasets.CAN]
+MEASURED = "obs/agentview_tcp_uv"
 
 
 def with_camera(path: Path, **changes) -> Calibration:
@@ -31,6 +32,13 @@ def posed(path: Path, turn) -> Calibration:
     """The pose of the camera replaced by `turn(pose)`."""
     pose = datasets.robosuite(path).cameras["agentview"].cam_to_base
     return with_camera(path, cam_to_base=turn(pose))
+
+
+def camera_of(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """K and pose that robosuite wrote."""
+    with h5py.File(path) as file:
+        info = json.loads(file["data/demo_0"].attrs["camera_info"])["agentview"]
+    return np.array(info["intrinsics"]), np.array(info["extrinsics"])
 
 
 @pytest.mark.parametrize("path", SAMPLES, ids=lambda path: path.stem)
@@ -55,6 +63,99 @@ def test_the_tcp_is_where_robosuite_renders_it(path: Path) -> None:
         assert found.most == pytest.approx(np.max(distances), abs=1e-5)
 
 
+@pytest.mark.parametrize("path", SAMPLES, ids=lambda path: path.stem)
+def test_pixels_measured_elsewhere_are_a_problem(path: Path, tmp_path: Path) -> None:
+    """K of another lens has the TCP in view, and the images may move as with another flip. By how
+    much it is off is computed from what robosuite wrote."""
+    K, pose = camera_of(path)
+    K[[0, 1], [0, 1]] /= 2
+    expected = []
+    with h5py.File(path) as file:
+        for demo in file["data"].values():
+            uv, _ = oracles.project(K, pose, demo["obs/robot0_eef_pos"][()])
+            expected += list(np.linalg.norm(uv - demo[MEASURED][()], axis=1))
+    with open_recording(path, with_camera(path, K=K)) as recording:
+        report = check.check(recording)
+        assert report.survey.in_view == 1.0 and report.reprojection is not None
+        assert report.reprojection.median == pytest.approx(np.median(expected), abs=1e-4)
+        assert report.reprojection.median > 5 and type(report.problem) is errors.ReprojectionError
+        with pytest.raises(errors.ReprojectionError, match=r"tcp_uv, got \d+\.\d px \(median of"):
+            job.preflight(recording)
+        assert job.preflight(recording, trust=True).in_view == 1.0
+    moved = posed(path, lambda pose: pose @ oracles.pose(np.eye(3), [0.03, 0, 0]))
+    with open_recording(path, moved) as recording:
+        problem = check.check(recording).problem
+    assert type(problem) is errors.ReprojectionError
+    bare = datasets.changed(
+        path, tmp_path, lambda f: [d.pop(MEASURED) for d in f["data"].values()] and None
+    )
+    with open_recording(bare, moved) as recording:
+        assert check.check(recording).problem is None  # nobody can know
+
+
+def distorted(uv: np.ndarray, K: np.ndarray, dist: tuple[float, ...]) -> np.ndarray:
+    """OpenCV's formula for k1, k2, p1, p2, in NumPy."""
+    x, y = ((uv - K[:2, 2]) / K[[0, 1], [0, 1]]).T
+    k1, k2, p1, p2 = dist
+    square = x**2 + y**2
+    radial = 1 + k1 * square + k2 * square**2
+    moved = [
+        x * radial + 2 * p1 * x * y + p2 * (square + 2 * x**2),
+        y * radial + 2 * p2 * x * y + p1 * (square + 2 * y**2),
+    ]
+    return np.stack(moved, 1) * K[[0, 1], [0, 1]] + K[:2, 2]
+
+
+def test_measured_pixels_are_those_of_the_lens(tmp_path: Path) -> None:
+    """Measured in the images as stored: distorted, and upside down."""
+    dist = (-0.3, 0.1, 0.01, -0.02)
+    K, _ = camera_of(datasets.LIFT)
+    far = []
+
+    def bend(file: h5py.File) -> None:
+        for demo in file["data"].values():
+            before = demo[MEASURED][()]
+            after = distorted(before, K, dist)
+            far.append(np.linalg.norm(after - before, axis=1).max())
+            demo[MEASURED][...] = after * [1, -1] + [0, 128]
+
+    path = datasets.changed(datasets.LIFT, tmp_path, bend)
+    assert max(far) > 1
+    with open_recording(path, with_camera(path, dist=dist, flip="ud")) as recording:
+        found = check.reprojection(recording)
+    assert found is not None and found.most < 0.2
+
+
+def test_points_that_the_lens_puts_nowhere() -> None:
+    """A barrel distortion folds: far outside, the model leads back into the image."""
+    camera = with_camera(datasets.LIFT, dist=(-0.3, 0.0, 0.0, 0.0)).cameras["agentview"]
+    folded = np.array([[64.0 + 154.5 * 1.8, 64.0]])
+    assert 0 < distorted(folded, camera.K, (-0.3, 0.0, 0.0, 0.0))[0, 0] < 128
+    assert np.isnan(motion.seen_uv(camera, folded, "none")).all()
+    inside = np.array([[[100.0, 30.0], [np.nan, np.nan]]])
+    got = motion.seen_uv(camera, inside, "none")
+    np.testing.assert_allclose(got[0, :1], distorted(inside[0, :1], camera.K, (-0.3, 0, 0, 0)),
+                               atol=1e-4)  # fmt: skip
+    assert np.isnan(got[0, 1]).all()
+
+
+def test_motion_is_looked_for_where_the_lens_shows_it() -> None:
+    """Changes that were drawn where NumPy says that the lens puts the TCP."""
+    dist = (0.9, 0.1, 0.01, 0.0)
+    camera = with_camera(datasets.LIFT, dist=dist).cameras["agentview"]
+    K, pose = camera_of(datasets.LIFT)
+    points = np.random.default_rng(0).uniform((-0.4, -0.4, 0.7), (0.4, 0.4, 1.2), (60, 2, 3))
+    uv, _ = oracles.project(K, pose, points.reshape(-1, 3))
+    u, v = distorted(uv, K, dist).T.reshape(2, 60, 2, 1, 1) * 48 / 128
+    row, column = np.mgrid[:48, :48] + 0.5
+    maps = np.exp(-((row - v) ** 2 + (column - u) ** 2) / (2 * 4**2)).sum(1).reshape(60, -1)
+    pairs = motion._Pairs(["demo_0"] * 60, points, maps - maps.mean(0))
+    parts, _ = motion._contributions(camera, pairs, motion.Reading("none"))
+    assert parts.mean() > 0.999
+    pinhole = dataclasses.replace(camera, dist=None)
+    assert motion._contributions(pinhole, pairs, motion.Reading("none"))[0].mean() < 0.95
+
+
 @pytest.mark.parametrize("flip", ["ud", "lr", "180", "cw", "ccw"])
 @pytest.mark.parametrize("path", SAMPLES, ids=lambda path: path.stem)
 def test_flips_are_named(path: Path, flip: str) -> None:
@@ -68,12 +169,16 @@ def test_flips_are_named(path: Path, flip: str) -> None:
 
 @pytest.mark.parametrize("flip", ["ud", "lr", "180"])
 def test_flipped_files_are_named(flip: str, tmp_path: Path) -> None:
-    images = calibration.FLIPS[flip](datasets.frames(datasets.CAN))
-    path = datasets.changed(
-        datasets.CAN,
-        tmp_path,
-        lambda file: datasets.replace(file["data/demo_0"], datasets.IMAGES, images),
-    )
+    def turn(file: h5py.File) -> None:
+        demo = file["data/demo_0"]
+        datasets.replace(
+            demo, datasets.IMAGES, calibration.FLIPS[flip](datasets.frames(datasets.CAN))
+        )
+        u, v = demo[MEASURED][()].T
+        left, up = flip in ("lr", "180"), flip in ("ud", "180")
+        demo[MEASURED][...] = np.stack([128 - u if left else u, 128 - v if up else v], 1)
+
+    path = datasets.changed(datasets.CAN, tmp_path, turn)
     with open_recording(path, datasets.robosuite(path)) as recording:
         report = check.check(recording)
     assert f"--flip {flip} --out" in str(report.problem)
@@ -134,6 +239,7 @@ def test_a_hand_that_stands_still_tells_nothing(tmp_path: Path) -> None:
         demo = file["data/demo_0"]
         for key in (datasets.IMAGES, "obs/robot0_eef_pos"):
             demo[key][...] = demo[key][:1]
+        del demo[MEASURED]
 
     path = datasets.changed(datasets.CAN, tmp_path, freeze)
     with open_recording(path, with_camera(path, flip="ud")) as recording:

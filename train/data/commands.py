@@ -420,7 +420,7 @@ class Align:
         was there is kept as source_*.
       transitions: frames with so many largest motions of an episode become the identity.
       least_in_view: share of frames that must show the TCP.
-      trust: skip looking at the images for a wrong calibration.
+      trust: skip looking at the images, and at pixels measured in them, for a wrong calibration.
     """
 
     file: File

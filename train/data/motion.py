@@ -16,6 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from palm_jax.align import Camera, distort_points
 from palm_jax.train.data.aligning import BLOCK
 from palm_jax.train.data.calibration import AXES, FLIPS, CameraCalibration, turned
 from palm_jax.train.data.importers import inverted
@@ -100,6 +101,13 @@ def pose_as(pose: np.ndarray, reading: Reading) -> np.ndarray:
     return (inverted(pose) if reading.inverse else pose) @ AXES[reading.axes]
 
 
+def camera_as(camera: CameraCalibration, episode: str, reading: Reading) -> Camera:
+    """The pinhole camera of an episode, its pose read in another way."""
+    plain = camera.camera(episode)
+    pose = pose_as(np.asarray(plain.cam_to_world, np.float64), reading)
+    return dataclasses.replace(plain, cam_to_world=pose.astype(np.float32))
+
+
 def _reread(rotation: np.ndarray, order: str) -> np.ndarray:
     """The rotation that the same three angles mean in the order "xyz" (fixed) or "XYZ" (own)."""
     if order == "XYZ":  # they were read about fixed axes: R = Rz Ry Rx
@@ -127,6 +135,27 @@ def stored_uv(flip: str, uv: np.ndarray, width: int, height: int) -> np.ndarray:
         "ccw": (height - v, u),
     }
     return np.stack(places[flip], -1)
+
+
+def seen_uv(camera: CameraCalibration, uv: np.ndarray, flip: str) -> np.ndarray:
+    """Where points are in the images as stored, lens and all.
+
+    Args:
+      camera: that took them.
+      uv: [..., 2] pixels at which a pinhole camera would show them, upright.
+      flip: what turns the stored images upright.
+
+    Returns:
+      [..., 2]; NaN for points that the lens puts nowhere near the image.
+    """
+    if camera.dist is not None:
+        size = np.array([camera.width, camera.height])
+        with np.errstate(invalid="ignore"):
+            # Further out the lens model may fold back into the image.
+            near = (np.abs(uv - size / 2) < size).all(-1, keepdims=True)
+        seen = distort_points(np.where(near, uv, np.nan), camera.K, camera.dist)
+        uv = np.asarray(seen, np.float64)
+    return stored_uv(flip, uv, camera.width, camera.height)
 
 
 def readings(camera: CameraCalibration) -> list[Reading]:
@@ -181,20 +210,13 @@ def _contributions(
 ) -> tuple[np.ndarray, float]:
     """[P] whose mean is the correlation, and the share of points in the image."""
     width, height = turned(reading.flip, camera.width, camera.height)
-    cells = np.empty((len(pairs.episodes), 2, 2))
+    uv = np.empty((len(pairs.episodes), 2, 2))
     visible = 0
-    cameras = {
-        episode: dataclasses.replace(
-            camera.camera(),
-            cam_to_world=pose_as(np.asarray(camera.camera(episode).cam_to_world, float), reading),
-        )
-        for episode in set(pairs.episodes)
-    }
+    cameras = {episode: camera_as(camera, episode, reading) for episode in set(pairs.episodes)}
     for index, (episode, points) in enumerate(zip(pairs.episodes, pairs.points, strict=True)):
-        uv, _ = projected(cameras[episode], points)
-        visible += int(inside(cameras[episode], uv).sum())
-        stored = stored_uv(reading.flip, uv, camera.width, camera.height)
-        cells[index] = stored * [_GRID / width, _GRID / height]
+        uv[index], _ = projected(cameras[episode], points)
+        visible += int(inside(cameras[episode], uv[index]).sum())
+    cells = seen_uv(camera, uv, reading.flip) * [_GRID / width, _GRID / height]
     grid = np.arange(_GRID) + 0.5
     # A spot is the product of a row and a column; one that is not seen is nothing.
     spots = np.exp(-((grid - cells[..., None]) ** 2) / (2 * _WIDTH**2))
