@@ -437,6 +437,42 @@ def test_changing_a_calibration(tmp_path: Path) -> None:
     assert kept.to_json() == calib.load(path).to_json()
 
 
+def test_one_camera_is_changed_and_the_others_stay(tmp_path: Path) -> None:
+    """What `data check` advises for a camera must not break those that are right."""
+    both = Calibration({"front": camera(), "side": camera(name="side", flip="lr")})
+    path = calib.save(both, tmp_path / "both.json")
+    changes = {"flip": "ud", "axes": "opengl", "image": "obs/x", "rescale": (320, 240)}
+    made = commands.make_calibration(options("palm", file=path, camera=("front",), **changes))
+    assert made.to_json()["cameras"]["side"] == both.to_json()["cameras"]["side"]
+    front = made.cameras["front"]
+    assert (front.flip, front.image, front.width) == ("ud", "obs/x", 320)
+    np.testing.assert_allclose(front.cam_to_base, POSE @ GL)
+    assert list(made.cameras) == ["front", "side"]
+    every = commands.make_calibration(options("palm", file=path, flip="ud"))
+    assert {each.flip for each in every.cameras.values()} == {"ud"}
+    with pytest.raises(CameraNameError, match="'top' is not in the calibration.*front, side"):
+        commands.make_calibration(options("palm", file=path, camera=("top",), flip="ud"))
+    with pytest.raises(CalibrationError, match="--image .*front, side; choose it with --camera"):
+        commands.make_calibration(options("palm", file=path, image="obs/x"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "users"),
+    [
+        ("robosuite", {"inverse": True}, "droid, npy, palm"),
+        ("mujoco", {"axes": "opengl"}, "droid, npy, palm"),
+        ("maniskill", {"K": "1,1,1,1"}, "droid, npy"),
+        ("palm", {"size": (64, 64)}, "robosuite, mujoco, maniskill, droid, npy"),
+        ("palm", {"extrinsics": "1,1,1,1,1,1"}, "droid, npy"),
+        ("npy", {"euler": "xyz"}, "droid"),
+    ],
+)
+def test_options_without_an_effect_are_refused(kind: str, values: dict, users: str) -> None:
+    (name,) = values
+    with pytest.raises(CalibrationError, match=f"--{name}: .*{kind} does not .*only {users};"):
+        commands.make_calibration(options(kind, file=Path("absent"), **values))
+
+
 def test_the_other_orientation_that_robosuite_writes() -> None:
     """`robot0_eef_quat_site` is that of the grip site, a quarter turn from the hand's."""
     other = datasets.robosuite(

@@ -204,7 +204,7 @@ def test_readings_of_the_pose_are_named(path: Path, mistake: str) -> None:
     assert report.problem is not None
     readings = [best.reading, *best.same]
     texts = [check.told(reading) for reading in readings]
-    commands_ = [check.remedy(reading) for reading in readings]
+    commands_ = [check.remedy(reading, "agentview") for reading in readings]
     assert any(command in line for line in commands_), commands_
     assert any(words in text for text in texts), texts
     # Taken at its word, the remedy gives the right camera back.
@@ -221,17 +221,60 @@ def test_readings_of_the_pose_are_named(path: Path, mistake: str) -> None:
 
 
 @pytest.mark.parametrize("wrong", ["xyz", "XYZ"])
-def test_the_order_of_angles_is_named(wrong: str) -> None:
-    """Six numbers written in one order and imported in the other."""
+def test_the_order_of_angles_is_named(wrong: str, tmp_path: Path) -> None:
+    """Six numbers written in one order and imported in the other. The images are bent by Pillow to
+    what a rolled camera sees: robosuite's own has angles that mean the same in both orders."""
     right = "XYZ" if wrong == "xyz" else "xyz"
-    pose = datasets.robosuite(datasets.CAN).cameras["agentview"].cam_to_base
-    # robosuite's camera has angles that mean the same in both orders: roll it a little.
-    pose = pose @ oracles.pose(Rotation.from_euler("zx", [0.35, 0.1]).as_matrix(), np.zeros(3))
-    angles = Rotation.from_matrix(pose[:3, :3]).as_euler(right)
-    misread = oracles.pose(Rotation.from_euler(wrong, angles).as_matrix(), pose[:3, 3])
-    reading = motion.Reading("none", euler=right)
-    np.testing.assert_allclose(motion.pose_as(misread, reading), pose, atol=1e-9)
-    assert f"--euler {right}" in check.remedy(reading)
+    K, pose = camera_of(datasets.CAN)
+    roll = Rotation.from_euler("zx", [0.35, 0.1]).as_matrix()
+    bend = K @ roll @ np.linalg.inv(K)
+    how = (128, 128), Image.Transform.PERSPECTIVE, tuple((bend / bend[2, 2]).ravel()[:8])
+
+    def rolled(file: h5py.File) -> None:
+        demo = file["data/demo_0"]
+        frames = [Image.fromarray(frame) for frame in demo[datasets.IMAGES][()]]
+        seen = [np.asarray(i.transform(*how, Image.Resampling.BILINEAR)) for i in frames]
+        datasets.replace(demo, datasets.IMAGES, np.stack(seen))
+        del demo[MEASURED]
+
+    path = datasets.changed(datasets.CAN, tmp_path, rolled)
+    true = pose @ oracles.pose(roll, np.zeros(3))
+    angles = Rotation.from_matrix(true[:3, :3]).as_euler(right)
+    misread = oracles.pose(Rotation.from_euler(wrong, angles).as_matrix(), true[:3, 3])
+    with open_recording(path, posed(path, lambda _: misread)) as recording:
+        report = check.check(recording)
+    assert report.motion.wrong and report.problem is not None
+    reading = report.motion.best.reading
+    assert reading == motion.Reading("none", euler=right)
+    np.testing.assert_allclose(motion.pose_as(misread, reading), true, atol=1e-9)
+    assert f"--euler {right} --flip none" in check.remedy(reading, "agentview")
+    with open_recording(path, posed(path, lambda _: true)) as recording:
+        assert check.check(recording).problem is None
+
+
+def test_remedies_leave_nothing_out() -> None:
+    every = check.remedy(motion.Reading("ud", inverse=True, euler="xyz"), "front")
+    assert every == "Import the camera again with --euler xyz --flip ud --inverse"
+    other = check.remedy(motion.Reading("lr", axes="opengl", inverse=True), "left eye")
+    assert "--camera 'left eye' --flip lr --axes opengl --inverse --out" in other
+
+
+def test_angles_are_the_last_guess() -> None:
+    """Readings that fit about as well: the one without angles is advised."""
+
+    def found(score: float, **reading) -> motion.Finding:
+        return motion.Finding(motion.Reading("none", **reading), score, 1.0, 5.0)
+
+    angles, inverse, axes = (
+        found(0.30, euler="xyz"), found(0.28, inverse=True), found(0.2, axes="opengl")
+    )  # fmt: skip
+    grouped = motion._grouped([axes, angles, inverse])
+    assert [f.reading for f in grouped] == [inverse.reading, angles.reading, axes.reading]
+    now = motion.Finding(motion.Reading("none"), 0.01, 1.0, 0.0)
+    assert motion.Motion(20, now, grouped).best.reading == inverse.reading
+    assert motion._grouped([found(0.2, inverse=True), angles])[0].reading == angles.reading
+    same = motion._grouped([angles, found(0.30, axes="opengl", inverse=True)])
+    assert same[0].reading.euler is None and same[0].same == (angles.reading,)
 
 
 def test_a_hand_that_stands_still_tells_nothing(tmp_path: Path) -> None:

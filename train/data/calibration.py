@@ -28,6 +28,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shlex
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -170,7 +171,8 @@ class CameraCalibration:
             raise ImageSizeError(
                 f"cameras.{self.name}: expected images of {width} x {height} pixels (width x "
                 f"height), as calibrated, got {got_width} x {got_height}; if they were resized: "
-                f"`data calibrate --from palm --file C --rescale {got_width} {got_height} --out N`"
+                f"`data calibrate --from palm --file C --camera {shlex.quote(self.name)} --rescale "
+                f"{got_width} {got_height} --out NEW`"
                 f"{also}"
             )
         return FLIPS[self.flip](images)
@@ -216,6 +218,19 @@ class Calibration:
             raise CalibrationError("cameras: expected at least one, got none")
         _checked_pose(self.ee_to_tcp, "T_ee_tcp")
 
+    def camera(self, name: str) -> CameraCalibration:
+        """A camera by its name.
+
+        Raises:
+          CameraNameError: not in the calibration.
+        """
+        if name not in self.cameras:
+            raise CameraNameError(
+                f"camera {name!r} is not in the calibration, which has "
+                f"{', '.join(sorted(self.cameras))}"
+            )
+        return self.cameras[name]
+
     def find(self, name: str | None, image_keys: Iterable[str]) -> tuple[CameraCalibration, str]:
         """A camera of this calibration and the key of its images.
 
@@ -227,13 +242,7 @@ class Calibration:
           CameraNameError: not in the calibration, without images, or several to choose from.
         """
         keys = list(image_keys)
-        if name is not None and name not in self.cameras:
-            raise CameraNameError(
-                f"camera {name!r} is not in the calibration, which has "
-                f"{', '.join(sorted(self.cameras))}; the file has images "
-                f"{', '.join(keys) or '(none)'}"
-            )
-        wanted = [name] if name is not None else list(self.cameras)
+        wanted = [self.camera(name).name] if name is not None else list(self.cameras)
         found = {n: key for n in wanted if (key := image_key(self.cameras[n], keys)) is not None}
         if len(found) == 1:
             ((only, key),) = found.items()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import shlex
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -128,7 +129,8 @@ def check_orientation(recording: Recording, evidence: Motion) -> None:
     raise kind(
         f"{where}: the images move elsewhere than the TCP (correlation "
         f"{evidence.as_is.score:.2f}), but fit if {told(best.reading, camera.flip)} "
-        f"({best.score:.2f}, {best.better:.0f} standard errors better). {remedy(best.reading)}; "
+        f"({best.score:.2f}, {best.better:.0f} standard errors better). "
+        f"{remedy(best.reading, camera.name)}; "
         "look at the sheet of `data check` (--trust if you know better)"
     )
 
@@ -157,14 +159,17 @@ def told(reading: Reading, flip: str = "none") -> str:
     return " and ".join(words) or "the calibration is taken as it is"
 
 
-def remedy(reading: Reading) -> str:
-    """The command that mends a calibration."""
+def remedy(reading: Reading, name: str) -> str:
+    """What mends the calibration of a camera: a command, or the options to import it with."""
+    options = f"--flip {reading.flip}"
+    options += f" --axes {reading.axes}" if reading.axes != "opencv" else ""
+    options += " --inverse" if reading.inverse else ""
     if reading.euler:
-        return f"Import the camera again with --euler {reading.euler}"
-    options = [f"--flip {reading.flip}"]
-    options += [f"--axes {reading.axes}"] if reading.axes != "opencv" else []
-    options += ["--inverse"] if reading.inverse else []
-    return f"`data calibrate --from palm --file C {' '.join(options)} --out NEW` mends it"
+        return f"Import the camera again with --euler {reading.euler} {options}"
+    return (
+        f"`data calibrate --from palm --file C --camera {shlex.quote(name)} {options} --out NEW` "
+        "mends it"
+    )
 
 
 def reprojection(

@@ -101,7 +101,8 @@ class Calibrate:
         calibration.json, to change it).
       out: the new file; nothing is overwritten.
       file: what to read, see `from`.
-      camera: names; by default all that have images (npy, droid: one name is needed).
+      camera: names; by default all that have images (npy, droid: one name is needed; palm: those to
+        change, the others stay as they are).
       size: width and height of the images that K describes, if no file tells.
       K: npy, droid: fx,fy,cx,cy or a .npy file of 3 x 3.
       extrinsics: npy: a .npy file of 4 x 4; droid: x,y,z and three angles.
@@ -159,20 +160,55 @@ def make_calibration(config: Calibrate) -> Calibration:
     Raises:
       CalibrationError, DataError: see `importers`.
     """
+    _check_used(config)
     old = None
     if config.from_ == "palm":
         old = calib.load(_file(config))
         made_from = old.made_from
-        cameras = {name: _changed_pose(camera, config) for name, camera in old.cameras.items()}
+        cameras = {
+            name: _changed_pose(old.camera(name), config) for name in config.camera or old.cameras
+        }
     else:
         cameras = _imported(config)
         made_from = f"{config.from_}: {config.file.name if config.file else 'numbers'}"
-    cameras = {name: _changed(camera, config) for name, camera in cameras.items()}
+    if config.image is not None and len(cameras) > 1:
+        raise CalibrationError(
+            f"--image names the images of one camera, not of {', '.join(cameras)}; choose it with "
+            "--camera"
+        )
+    kept = old.cameras if old is not None else {}
+    cameras = {**kept, **{name: _changed(camera, config) for name, camera in cameras.items()}}
     before = old.robot if old is not None else RobotKeys()
     given = {f.name: getattr(config, f.name) for f in dataclasses.fields(RobotKeys)}
     robot = dataclasses.replace(before, **{k: v for k, v in given.items() if v is not None})
     tcp = old.ee_to_tcp if old is not None else np.eye(4)
     return Calibration(cameras, _tcp(config, tcp), robot, made_from)
+
+
+_USED = {
+    "robosuite": {"size"},
+    "mujoco": {"size"},
+    "maniskill": {"size"},
+    "droid": {"size", "K", "extrinsics", "euler", "inverse", "axes"},
+    "npy": {"size", "K", "extrinsics", "inverse", "axes"},
+    "palm": {"inverse", "axes"},
+}
+"""Options that not every importer uses."""
+
+
+def _check_used(config: Calibrate) -> None:
+    """Raises for an option that would have no effect.
+
+    Raises:
+      CalibrationError: with what uses it.
+    """
+    for field in dataclasses.fields(config):
+        users = [kind for kind, used in _USED.items() if field.name in used]
+        if users and config.from_ not in users and getattr(config, field.name) != field.default:
+            raise CalibrationError(
+                f"--{field.name}: --from {config.from_} does not use it, only {', '.join(users)}; "
+                "leave it out, or change the finished calibration with --from palm"
+            )
 
 
 def _file(config: Calibrate) -> Path:

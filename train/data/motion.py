@@ -36,6 +36,9 @@ SURE = 3.0
 CLEARLY = 1.3
 """Factor by which its correlation must be larger."""
 
+ALIKE = 0.9
+"""Correlations from this share of the best on are taken for as good."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Reading:
@@ -47,9 +50,9 @@ class Reading:
     euler: str | None = None  # the three angles of the pose read in the other order
 
     @property
-    def changes(self) -> int:
-        """How much is taken to be wrong, apart from the flip."""
-        return (self.axes != "opencv") + self.inverse + (self.euler is not None)
+    def guessed(self) -> tuple[bool, int]:
+        """How much is taken to be wrong, apart from the flip; angles weigh most."""
+        return self.euler is not None, (self.axes != "opencv") + self.inverse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +77,8 @@ class Motion:
     @property
     def best(self) -> Finding:
         """The best reading, the given one included."""
-        return max((self.as_is, *self.others), key=lambda finding: finding.score)
+        first = self.others[:1]
+        return max((self.as_is, *first), key=lambda finding: finding.score)
 
     @property
     def wrong(self) -> bool:
@@ -196,12 +200,18 @@ def examine(recording: Recording) -> Motion:
 
 
 def _grouped(found: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Best first; readings that give the same pixels together, the simplest in front."""
-    order = sorted(found, key=lambda f: (-round(f.score, 6), f.reading.changes))
+    """Best first; readings that give the same pixels together, the simplest in front.
+
+    Angles read in another order are a guess: where the pose need not have been made of angles at
+    all, a reading without them that fits about as well goes first.
+    """
+    order = sorted(found, key=lambda f: (-round(f.score, 6), f.reading.guessed))
     groups = []
     for _, members in itertools.groupby(order, key=lambda f: round(f.score, 6)):
         first, *rest = members
         groups.append(dataclasses.replace(first, same=tuple(f.reading for f in rest)))
+    alike = ALIKE * groups[0].score if groups else 0.0
+    groups.sort(key=lambda f: (f.score < alike, f.score >= alike and f.reading.euler is not None))
     return tuple(groups)
 
 
