@@ -379,6 +379,34 @@ def test_ten_minutes(
     assert "1 episodes written: c.hdf5" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("place", ["data", "calibration", "notes", "folder"])
+def test_a_sheet_replaces_a_sheet_and_nothing_else(
+    place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = datasets.changed(datasets.CAN, tmp_path, lambda file: None)
+    told = calibration.save(datasets.robosuite(given), tmp_path / "c.json")
+    (tmp_path / "notes.png").write_text("not a picture")
+    (tmp_path / "folder").mkdir()
+    out = {"data": given, "calibration": told, "notes": tmp_path / "notes.png"}
+    out |= {"folder": tmp_path / "folder"}
+    before = datasets.digest(tmp_path)
+    assert run("check", given, "--calibration", told, "--out", out[place]) == 2
+    assert "OutputError: " in capsys.readouterr().err and datasets.digest(tmp_path) == before
+    for _ in range(2):
+        assert run("check", given, "--calibration", told, "--out", tmp_path / "sheet.png") == 0
+
+
+def test_a_sheet_does_not_lie_in_the_data(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = datasets.lerobot(tmp_path)
+    told = calibration.save(datasets.lerobot_calibration(), tmp_path / "c.json")
+    Image.new("RGB", (4, 4)).save(root / "a.png")
+    before = datasets.digest(root)
+    assert run("check", root, "--calibration", told, "--out", root / "a.png") == 2
+    assert "lies inside the source" in capsys.readouterr().err and datasets.digest(root) == before
+
+
 def test_the_code_of_the_page_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = (datasets.SAMPLES.parents[1] / "docs" / "your_data.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

@@ -14,13 +14,14 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from palm_jax.align import AlignSpec, Camera, tcp_overlay, undistort
-from palm_jax.train.data import motion
+from palm_jax.train.data import motion, output
 from palm_jax.train.data.calibration import CameraCalibration
 from palm_jax.train.data.errors import (
     DataError,
     FormatError,
     ImageOrientationError,
     KeyMissingError,
+    OutputError,
     ReprojectionError,
     TcpOutOfViewError,
 )
@@ -37,6 +38,8 @@ from palm_jax.train.data.source import Source
 from palm_jax.train.metrics import write_atomic
 
 PANELS, COLUMNS, PANEL, CAPTION = 12, 4, 320, 22
+
+_PNG = b"\x89PNG\r\n\x1a\n"
 
 LEAST_PIXELS, PIXELS_SHARE = 3.0, 0.01
 """How far from measured pixels the TCP may be computed, in pixels, and as a share of the image's
@@ -247,6 +250,31 @@ def check_reprojection(recording: Recording, found: Reprojection | None) -> None
 
 
 # -- the sheet -------------------------------------------------------------------------------------
+
+
+def check_sheet(path: Path, source: Path) -> None:
+    """Raises where a sheet would replace anything but an older one.
+
+    Args:
+      path: of the sheet.
+      source: the data.
+
+    Raises:
+      OutputError: no PNG; in the source's folder.
+    """
+    output.check_outside(path, source)
+    if path.exists() and not _is_png(path):
+        raise OutputError(
+            f"{path} exists and is no PNG; a sheet replaces only an older sheet: choose another "
+            "--out"
+        )
+
+
+def _is_png(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(_PNG)) == _PNG
 
 
 def sheet(recording: Recording, report: Report, spec: AlignSpec, path: Path) -> Path:

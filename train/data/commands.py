@@ -357,7 +357,8 @@ class Check:
       file: robomimic HDF5 file, or folder of a LeRobot v3 data set.
       calibration: calibration.json.
       camera: name; by default the only one with images.
-      out: the sheet of overlays; by default FILE-CAMERA.png in the current folder.
+      out: the sheet of overlays; by default FILE-CAMERA.png in the current folder. It replaces an
+        older sheet, nothing else.
       least_in_view: share of frames that must show the TCP.
       pixels: key of measured pixels of the TCP; by default CAMERA_tcp_uv, if there is one.
     """
@@ -372,8 +373,9 @@ class Check:
 
 def run_check(config: Check, console: Console) -> int:
     with open_recording(config.file, config.calibration, camera=config.camera) as recording:
-        report = check.check(recording, least=config.least_in_view, pixels=config.pixels)
         out = config.out or Path(f"{config.file.stem}-{recording.camera.name}.png")
+        check.check_sheet(out, config.file)
+        report = check.check(recording, least=config.least_in_view, pixels=config.pixels)
         spec = aligning.paper_spec(recording.camera.height)
         with disk_full(out, "the sheet was not written"):
             check.sheet(recording, report, spec, out)
