@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -516,7 +517,7 @@ def test_verify_finds_what_does_not_add_up(tmp_path: Path) -> None:
     path = datasets.changed(datasets.LIFT, tmp_path, spoil)
     problems = data.verify(path)
     assert problems[""] == ["total is 99, not 33"]
-    assert "NaN or infinity in 1 frames from 3 on" in problems["demo_0"][0]
+    assert "NaN or infinity in 1 frames, the first at 3" in problems["demo_0"][0]
     assert f"{datasets.IMAGES} has 16 images, expected 18" in problems["demo_1"]
     assert "obs/robot0_joint_pos has 17 rows, expected 18" in problems["demo_1"]
 
@@ -539,6 +540,79 @@ def test_repair_leaves_the_unsound_out(tmp_path: Path) -> None:
         assert list(file["mask/valid"][()]) == [b"demo_1"] and list(file["data"]) == ["demo_1"]
         assert file["data"].attrs["total"] == 18
         assert json.loads(file["data"].attrs["palm_repair"])["dropped"]["demo_0"]
+
+
+def scaled(poses: np.ndarray) -> np.ndarray:
+    poses[3] *= [[2.0], [2.0], [2.0], [1.0]]
+    return poses
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "words"),
+    [
+        ("obs/robot0_eef_quat", lambda q: q * (np.arange(15) != 4)[:, None], "length 1"),
+        ("obs/palm_tcp", scaled, "frame 3: expected an orthonormal"),
+        ("obs/robot0_gripper_qpos", lambda q: q / (np.arange(15) != 4)[:, None], "has NaN"),
+        ("obs/robot0_gripper_qpos", lambda q: q[:-1], "expected 15 rows in .*, got 14"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:divide by zero")
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_repair_leaves_out_what_align_refuses(
+    key: str, change: Callable[[np.ndarray], np.ndarray], words: str, aligned: Path, tmp_path: Path
+) -> None:
+    def spoil(file: h5py.File) -> None:
+        demo = file["data/demo_0"]
+        datasets.replace(demo, key, change(demo[key][()]))
+
+    told = datasets.robosuite()
+    if key == "obs/palm_tcp":
+        told = dataclasses.replace(told, robot=data.RobotKeys("palm_tcp", None, "palm_opening"))
+        camera = dataclasses.replace(told.cameras["agentview"], image=datasets.IMAGES)
+        told = dataclasses.replace(told, cameras={"agentview": camera})
+    path = datasets.changed(aligned, tmp_path, spoil)
+    with h5py.File(path, "r+") as file, h5py.File(datasets.LIFT) as old:
+        for name in ("demo_0", "demo_1"):
+            old.copy(old[f"data/{name}/{datasets.IMAGES}"], file[f"data/{name}/obs"])
+    with (
+        open_recording(path, told) as recording,
+        pytest.raises(DataError, match=f"demo_0: .*{words}.* data repair .* --calibration C"),
+    ):
+        recording.survey()
+    problems = data.verify(path, robot=told.robot)
+    assert list(problems) == ["demo_0"] and re.search(words, problems["demo_0"][0])
+    assert data.repair(path, tmp_path / "new.hdf5", robot=told.robot).kept == ("demo_1",)
+    with open_recording(tmp_path / "new.hdf5", told) as recording:
+        assert recording.survey().episodes == 1
+
+
+def test_a_damaged_first_episode_hides_no_other(tmp_path: Path) -> None:
+    """Its gripper cannot be read, by which the keys are recognised."""
+
+    def spoil(file: h5py.File) -> None:
+        values = file["data/demo_0/obs/robot0_gripper_qpos"][()]
+        datasets.replace(file["data/demo_0"], "obs/robot0_gripper_qpos", values, compression="gzip")
+        file["data/demo_0/obs/robot0_gripper_qpos"].id.write_direct_chunk((0, 0), b"\0" * 50)
+        file["data/demo_1/obs/robot0_eef_pos"][3] = np.nan
+        file.copy("data/demo_1", "data/demo_2")
+        file["data/demo_2/obs/robot0_eef_pos"][3] = file["data/demo_2/obs/robot0_eef_pos"][2]
+
+    path = datasets.changed(datasets.LIFT, tmp_path, spoil)
+    assert "cannot be read" in data.verify(path)["demo_0"][0]
+    assert data.repair(path, tmp_path / "new.hdf5").kept == ("demo_2",)
+
+
+def test_poses_that_nobody_looked_at_are_mentioned(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = datasets.lerobot(tmp_path)
+    path = data.save_calibration(datasets.lerobot_calibration(), tmp_path / "c.json")
+    for command in (["verify"], ["repair", "--out", str(tmp_path / "new")]):
+        words = ["data", command[0], str(root), *command[1:]]
+        assert main(words) == 0
+        assert "poses were not looked at; pass --calibration" in capsys.readouterr().out
+    assert main(["data", "verify", str(root), "--calibration", str(path)]) == 0
+    assert "not looked at" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("share", [0.55, 0.7, 0.9])

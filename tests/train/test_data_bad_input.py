@@ -258,10 +258,12 @@ CASES: dict[str, Case] = {
     ),
     # Episodes.
     "an episode of length one": Case(
-        "EpisodeLengthError", ["demo_0 has 1 frame;", "data repair"], change=every(1)
+        "EpisodeLengthError", ["demo_0: expected at least two frames", "got 1;", "data repair"],
+        change=every(1),
     ),
     "an empty episode": Case(
-        "EpisodeLengthError", ["demo_0 has 0 frames;", "data repair"], change=every(0)
+        "EpisodeLengthError", ["demo_0: expected at least two frames", "got 0;", "data repair"],
+        change=every(0),
     ),
     "fewer poses than actions": Case(
         "EpisodeLengthError", ["expected 31 rows in robot0_eef_pos", "got 28", "data repair"],

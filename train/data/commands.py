@@ -561,18 +561,28 @@ class Verify:
 
 
 def run_verify(config: Verify, console: Console) -> int:
-    problems = soundness.verify(config.file, robot=_robot(config.calibration))
+    robot = _robot(config.calibration)
+    problems = soundness.verify(config.file, robot=robot)
+    _print_unread(config.file, robot, console)
     for name, texts in problems.items():
         for text in texts:
             console.print(f"{name or config.file}: {text}", markup=False)
     if problems:
-        advice = (
-            f"`python -m palm_jax data repair {config.file} --out NEW` saves the sound episodes"
+        told = f" --calibration {config.calibration}" if config.calibration is not None else ""
+        console.print(
+            f"`python -m palm_jax data repair {config.file}{told} --out NEW` saves the sound "
+            "episodes",
+            markup=False,
         )
-        console.print(advice, markup=False)
         return 1
     console.print(f"{config.file}: sound", markup=False)
     return 0
+
+
+def _print_unread(path: Path, robot: RobotKeys | None, console: Console) -> None:
+    reason = soundness.unread(path, robot=robot)
+    if reason:
+        console.print(f"note: poses were not looked at; pass --calibration. {reason}", markup=False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -594,6 +604,7 @@ def run_repair(config: Repair, console: Console) -> int:
     calibration = None if config.calibration is None else calib.load(config.calibration)
     robot = None if calibration is None else calibration.robot
     result = soundness.repair(config.file, config.out, robot=robot)
+    _print_unread(config.file, robot, console)
     for name, reason in result.dropped.items():
         console.print(f"left out {name}: {reason}", markup=False)
     console.print(f"{len(result.kept)} episodes written: {result.path}", markup=False)

@@ -19,6 +19,7 @@ from palm_jax.train.data import rotations
 from palm_jax.train.data.calibration import Calibration, CameraCalibration, RobotKeys
 from palm_jax.train.data.errors import (
     CalibrationError,
+    DataError,
     EpisodeLengthError,
     EulerAmbiguityError,
     FormatError,
@@ -129,47 +130,19 @@ class Recording:
         """The robot's path in an episode.
 
         Raises:
-          EpisodeLengthError: fewer than two frames, or arrays of different lengths.
-          PoseDataError: poses that are not finite or not rigid, a gripper that is not finite.
-          FormatError: see `rotations.poses`.
+          EpisodeLengthError, PoseDataError, FormatError: see `trajectory_of`.
+          DataError: see `Source.columns`.
         """
-        where = f"{self.source.path}: {episode}"
-        length = self.source.length(episode)
-        if length < 2:
-            raise EpisodeLengthError(
-                f"{where} has {length} frame{'s' * (length != 1)}; a motion needs two. Leave it "
-                f"out: `python -m palm_jax data repair {self.source.path} --out NEW`"
-            )
-        assert self.keys.pose and self.keys.rotation and self.keys.opening
-        numbers = self.source.columns(episode, self.keys.pose)
-        gripper = self.source.columns(episode, self.keys.opening)
-        for key, values in ((self.keys.pose, numbers), (self.keys.opening, gripper)):
-            if len(values) != length:
-                raise EpisodeLengthError(
-                    f"{where}: expected {length} rows in {key}, got {len(values)}; leave the "
-                    "episode out with `data repair`"
-                )
-        if not np.isfinite(gripper).all():
-            raise PoseDataError(f"{where}: {self.keys.opening} has NaN or infinity")
-        return Trajectory(self._tcp(numbers, where), self._opening(gripper))
-
-    def _tcp(self, numbers: np.ndarray, where: str) -> np.ndarray:
-        advice = "leave the episode out with `data repair`, or mend it where it was made"
-        assert self.keys.rotation is not None
+        numbers, gripper = robot_columns(self.source, episode, self.keys)
         try:
-            poses = rotations.poses(numbers, self.keys.rotation)
-        except (PoseDataError, FormatError) as error:
-            raise type(error)(f"{where}: {self.keys.pose}: {error}; {advice}") from error
-        try:
-            check_pose(poses, self.keys.pose or "")
-        except PoseError:
-            raise PoseDataError(f"{where}: {_first_problem(poses)}; {advice}") from None
-        return poses @ self.calibration.ee_to_tcp
-
-    def _opening(self, gripper: np.ndarray) -> np.ndarray:
-        closed, opened = self.keys.closed, self.keys.open
-        assert closed is not None and opened is not None
-        return np.clip((gripper_values(gripper) - closed) / (opened - closed), 0.0, 1.0)
+            hand = trajectory_of(self.keys, numbers, gripper, self.source.length(episode))
+        except (EpisodeLengthError, PoseDataError, FormatError) as error:
+            raise type(error)(
+                f"{self.source.path}: {episode}: {error}; leave the episode out: `python -m "
+                f"palm_jax data repair {self.source.path} --calibration C --out NEW`, or mend it "
+                "where it was made"
+            ) from error
+        return Trajectory(hand.tcp @ self.calibration.ee_to_tcp, hand.opening)
 
     def survey(self, episodes: Iterable[str] | None = None) -> Survey:
         """Reads every pose and tells where the TCP appears.
@@ -193,6 +166,56 @@ class Recording:
             len(names), frames, seen / frames, behind / frames, tuple(uvs), names[worst],
             shares[worst],
         )  # fmt: skip
+
+
+def robot_columns(source: Source, episode: str, keys: RobotKeys) -> tuple[np.ndarray, np.ndarray]:
+    """Pose [T, n] and gripper [T, m] of an episode, as the file has them.
+
+    Raises:
+      DataError: see `Source.columns`.
+    """
+    assert keys.pose and keys.opening
+    return source.columns(episode, keys.pose), source.columns(episode, keys.opening)
+
+
+def trajectory_of(
+    keys: RobotKeys, numbers: np.ndarray, gripper: np.ndarray, length: int
+) -> Trajectory:
+    """The hand's path out of what a file has.
+
+    Args:
+      keys: nothing left open.
+      numbers, gripper: see `robot_columns`.
+      length: frames that the episode should have.
+
+    Raises:
+      EpisodeLengthError: fewer than two frames, or arrays of another length.
+      PoseDataError: poses that are not finite or not rigid, a gripper that is not finite.
+      FormatError: see `rotations.poses`.
+    """
+    assert keys.pose and keys.rotation and keys.opening
+    if length < 2:
+        raise EpisodeLengthError(f"expected at least two frames, a motion, got {length}")
+    for key, values in ((keys.pose, numbers), (keys.opening, gripper)):
+        if len(values) != length:
+            raise EpisodeLengthError(f"expected {length} rows in {key}, got {len(values)}")
+    try:
+        poses = rotations.poses(numbers, keys.rotation)
+    except (PoseDataError, FormatError) as error:
+        raise type(error)(f"{keys.pose}: {error}") from error
+    try:
+        check_pose(poses, keys.pose)
+    except PoseError:
+        raise PoseDataError(f"{keys.pose}: {_first_problem(poses)}") from None
+    if not np.isfinite(gripper).all():
+        raise PoseDataError(f"{keys.opening} has NaN or infinity")
+    return Trajectory(poses, np.clip(openness(keys, gripper), 0.0, 1.0))
+
+
+def openness(keys: RobotKeys, gripper: np.ndarray) -> np.ndarray:
+    """[T] of the gripper's columns [T, m]: 0 where it is as when closed, 1 as when open."""
+    assert keys.closed is not None and keys.open is not None
+    return (gripper_values(gripper) - keys.closed) / (keys.open - keys.closed)
 
 
 def _check_episodes(source: Source, camera: CameraCalibration) -> None:
@@ -310,9 +333,24 @@ def _known(source: Source, names: Iterable[str]) -> str | None:
     return None
 
 
+def _sample(source: Source, expression: str) -> np.ndarray:
+    """The columns in the first episode that can be read: a damaged one is named where it is used.
+
+    Raises:
+      DataError: none can.
+    """
+    problems = []
+    for name in source.episodes:
+        try:
+            return source.columns(name, expression)
+        except DataError as error:
+            problems.append(error)
+    raise problems[0]
+
+
 def _rotation(source: Source, pose: str) -> str:
     """How to read a pose by its number of columns alone, where that settles it."""
-    numbers = source.columns(source.episodes[0], pose)
+    numbers = _sample(source, pose)
     count = numbers.shape[1]
     if count in (9, 16):
         return "rot6d" if count == 9 else "matrix"
@@ -352,7 +390,7 @@ def _gripper(source: Source, given: RobotKeys) -> tuple[str, float, float]:
             f"{source.path}: which key is the gripper? None is known by name. Write it into the "
             "calibration: `data calibrate ... --opening KEY --closed VALUE --open VALUE`"
         )
-    columns = source.columns(source.episodes[0], opening)
+    columns = _sample(source, opening)
     count, closed, opened = KNOWN_OPENINGS.get(opening, (0, None, None))
     closed = given.closed if given.closed is not None else closed
     opened = given.open if given.open is not None else opened
@@ -363,7 +401,7 @@ def _gripper(source: Source, given: RobotKeys) -> tuple[str, float, float]:
         raise OpeningError(
             f"{source.path}: what is {opening} when the gripper is closed, and what when open? "
             f"{several if columns.shape[1] > 1 else 'It goes'} from {size.min():.4g} to "
-            f"{size.max():.4g} in the first episode. Write it into the calibration: "
+            f"{size.max():.4g} in an episode. Write it into the calibration: "
             "`data calibrate ... --opening KEY --closed VALUE --open VALUE`"
         )
     if closed == opened:

@@ -24,7 +24,7 @@ from palm_jax.train.data.errors import (
 )
 from palm_jax.train.data.lerobot import LeRobotSource
 from palm_jax.train.data.lerobot_writer import LeRobotWriter
-from palm_jax.train.data.recording import robot_keys
+from palm_jax.train.data.recording import robot_columns, robot_keys, trajectory_of
 from palm_jax.train.data.robomimic import REPAIR, RobomimicSource
 from palm_jax.train.data.source import Source, fingerprint, open_source
 
@@ -37,19 +37,19 @@ _PER_FRAME = ("actions", "states", "rewards", "dones")
 def verify(path: Path, *, robot: RobotKeys | None = None) -> Problems:
     """Reads everything and reports what is wrong; empty if the file is sound.
 
-    Lengths, totals, finite poses and actions, images that can be decoded or counted, and the
-    checksums of what `data align` has written.
+    Lengths, totals, poses that `data align` would take, finite actions, images that can be decoded
+    or counted, and the checksums of what `data align` has written.
 
     Args:
       path: file or folder.
-      robot: keys of the pose and the gripper, where they are not known ones.
+      robot: keys of the pose and the gripper, where they are not known ones; see `unread`.
 
     Raises:
       FormatError, TruncatedError: the file cannot even be opened.
     """
     with open_source(path) as source:
         problems: Problems = {}
-        keys = _pose_keys(source, robot or RobotKeys())
+        keys = _known_keys(source, robot or RobotKeys())
         for name in source.episodes:
             found = _episode(source, name, keys)
             if found:
@@ -58,29 +58,36 @@ def verify(path: Path, *, robot: RobotKeys | None = None) -> Problems:
         return ({"": whole} if whole else {}) | problems
 
 
-def _pose_keys(source: Source, robot: RobotKeys) -> list[str]:
-    """Expressions whose numbers must be finite."""
+def unread(path: Path, *, robot: RobotKeys | None = None) -> str:
+    """Why the poses of a file are not looked at, or an empty string.
+
+    Args:
+      path, robot: see `verify`.
+    """
+    with _opened(path) as source:
+        try:
+            robot_keys(source, robot or RobotKeys())
+        except DataError as error:
+            return str(error).removeprefix(f"{path}: ")
+    return ""
+
+
+def _known_keys(source: Source, robot: RobotKeys) -> RobotKeys | None:
+    """Where the robot's poses are, if that is known."""
     try:
-        keys = robot_keys(source, robot)
+        return robot_keys(source, robot)
     except DataError:
-        return []
-    return [key for key in (keys.pose, keys.opening) if key]
+        return None
 
 
-def _episode(source: Source, name: str, keys: list[str]) -> list[str]:
+def _episode(source: Source, name: str, keys: RobotKeys | None) -> list[str]:
     problems: list[str] = []
     try:
         length = source.length(name)
-        if length < 2:
-            problems.append(f"{length} frame{'s' * (length != 1)}")
-        actions = [key for key in source.number_keys if key in ("actions", "action")]
-        for key in [*keys, *actions]:
-            values = source.columns(name, key)
-            if len(values) != length:
-                problems.append(f"{key} has {len(values)} rows, expected {length}")
-            bad = np.flatnonzero(~np.isfinite(values).all(1))
-            if len(bad):
-                problems.append(f"{key} has NaN or infinity in {len(bad)} frames from {bad[0]} on")
+        problems += _robot(source, name, keys, length)
+        for key in source.number_keys:
+            if key in ("actions", "action"):
+                problems += _finite_rows(key, source.columns(name, key), length)
         for key in source.image_keys:
             count = _count(source, name, key)
             if count != length:
@@ -90,6 +97,24 @@ def _episode(source: Source, name: str, keys: list[str]) -> list[str]:
     except (DataError, OSError, RuntimeError, KeyError, ValueError) as error:
         problems.append(str(error).removeprefix(f"{source.path}: "))
     return problems
+
+
+def _robot(source: Source, name: str, keys: RobotKeys | None, length: int) -> list[str]:
+    """What `Recording.trajectory` would refuse."""
+    if keys is None or length < 2:
+        return [f"{length} frame{'s' * (length != 1)}"] if length < 2 else []
+    try:
+        trajectory_of(keys, *robot_columns(source, name, keys), length)
+    except DataError as error:
+        return [str(error).removeprefix(f"{source.path}: ")]
+    return []
+
+
+def _finite_rows(key: str, values: np.ndarray, length: int) -> list[str]:
+    if len(values) != length:
+        return [f"{key} has {len(values)} rows, expected {length}"]
+    bad = np.flatnonzero(~np.isfinite(values).all(1))
+    return [f"{key} has NaN or infinity in {len(bad)} frames from {bad[0]} on"] if len(bad) else []
 
 
 def _count(source: Source, name: str, key: str) -> int:
@@ -216,7 +241,7 @@ def _unsound(source: Source, name: str, robot: RobotKeys) -> list[str]:
         lost = source.lost(name)
         if lost:
             return [f"{lost} lies beyond the end of the file"]
-    problems = _episode(source, name, _pose_keys(source, robot))
+    problems = _episode(source, name, _known_keys(source, robot))
     # What copying puts right is no reason to drop an episode.
     return [text for text in problems if not text.startswith("num_samples")]
 
