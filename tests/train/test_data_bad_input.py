@@ -50,6 +50,10 @@ def pose() -> np.ndarray:
     return datasets.robosuite(datasets.CAN).cameras["agentview"].cam_to_base
 
 
+def intrinsics(cx: float, cy: float) -> np.ndarray:
+    return np.array([[154.5, 0, cx], [0, 154.5, cy], [0, 0, 1]])
+
+
 def images(turn: Callable[[np.ndarray], np.ndarray]) -> Change:
     """The stored images turned."""
 
@@ -158,11 +162,16 @@ CASES: dict[str, Case] = {
     ),
     "K for another resolution": Case(
         "ImageSizeError", ["expected images of 512 x 512", "got 128 x 128", "--rescale 128 128"],
-        calibrated={"width": 512, "height": 512},
+        calibrated={"width": 512, "height": 512, "K": lambda: intrinsics(256, 256)},
     ),
     "K with another principal point": Case(
-        "ImageSizeError", ["principal point inside", "another resolution", "--rescale"],
-        calibrated={"K": lambda: np.array([[618.0, 0, 256], [0, 618, 256], [0, 0, 1]])},
+        "ImageSizeError", ["principal point near", "cx = 256.0 of 128;", "another resolution",
+                           "--rescale"],
+        calibrated={"K": lambda: intrinsics(256, 256)},
+    ),
+    "K for a smaller resolution": Case(
+        "ImageSizeError", ["cx = 32.0 of 128;", "another resolution", "--rescale", "--off-centre"],
+        calibrated={"K": lambda: intrinsics(32, 32)},
     ),
     "TCP behind the camera": Case(
         "TcpBehindCameraError", ["behind the camera in 100%", "inverted", "data check"],
@@ -199,7 +208,8 @@ CASES: dict[str, Case] = {
     ),
     "images turned, not square": Case(
         "ImageSizeError", ["96 x 128", "got 128 x 96", "--flip cw or ccw"],
-        change=images(lambda i: i[:, :96]), calibrated={"width": 96},
+        change=images(lambda i: i[:, :96]),
+        calibrated={"width": 96, "K": lambda: intrinsics(48, 64)},
     ),
     # Measured pixels.
     "a camera that was moved": Case(

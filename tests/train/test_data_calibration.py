@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import datasets
@@ -144,6 +145,18 @@ MIRROR = (POSE @ np.diag([1.0, -1.0, 1.0, 1.0])).tolist()
         ({"cameras__front__K": "no"}, CalibrationError, "expected numbers"),
         ({"cameras__front__width": 0}, CalibrationError, "number of pixels"),
         ({"cameras__front__width": 320}, ImageSizeError, "another resolution"),
+        (
+            {"cameras__front__width": 1280},
+            ImageSizeError,
+            "cx = 330.0 of 1280; .*another resolu",
+        ),
+        (
+            {"cameras__front__height": 900},
+            ImageSizeError,
+            "cy = 235.0 of 900; .*--off-centre",
+        ),
+        ({"cameras__front__off_centre": -1}, CalibrationError, "off_centre: expected a share"),
+        ({"cameras__front__off_centre": "no"}, CalibrationError, "off_centre: expected a share"),
         ({"cameras__front__flip": "left"}, CalibrationError, "none, ud, lr"),
         ({"cameras__front__dist": [0.1]}, CalibrationError, "4, 5, 8"),
         ({"cameras__front__dist": [None] * 5}, CalibrationError, "finite|numbers"),
@@ -262,6 +275,55 @@ def test_a_camera_that_stands_elsewhere_in_one_episode(tmp_path: Path) -> None:
     assert list(camera.by_episode) == ["demo_1"]
     shift = camera.camera("demo_1").cam_to_world - camera.camera("demo_0").cam_to_world
     np.testing.assert_allclose(shift[:, 3], [0.25, 0, 0, 0], atol=1e-6)
+
+
+def information(change) -> Callable[[h5py.File], None]:
+    """Changes `camera_info` of agentview in the second episode, or with its names in all."""
+
+    def apply(file: h5py.File) -> None:
+        for name, demo in file["data"].items():
+            info = json.loads(demo.attrs["camera_info"])
+            change(name, info["agentview"])
+            demo.attrs["camera_info"] = json.dumps(info)
+
+    return apply
+
+
+def test_intrinsics_of_smaller_images(tmp_path: Path) -> None:
+    """camera_info of 64 pixels beside images of 128."""
+
+    def halve(_: str, entry: dict) -> None:
+        entry["intrinsics"] = (np.array(entry["intrinsics"]) * [[0.5], [0.5], [1]]).tolist()
+
+    path = datasets.changed(datasets.LIFT, tmp_path, information(halve))
+    with pytest.raises(ImageSizeError, match="cx = 32.0 of 128; K belongs to another resolution"):
+        datasets.robosuite(path)
+    told = datasets.robosuite(path, size=(64, 64), rescale=(128, 128))
+    right = datasets.robosuite().cameras["agentview"]
+    np.testing.assert_allclose(told.cameras["agentview"].K, right.K, rtol=1e-9)
+    cropped = datasets.robosuite(path, off_centre=0.3)
+    again = calib.load(calib.save(cropped, tmp_path / "c.json"))
+    assert again.cameras["agentview"].off_centre == 0.3 and again.sha256 == cropped.sha256
+
+
+def test_intrinsics_that_differ_between_episodes(tmp_path: Path) -> None:
+    def zoom(name: str, entry: dict) -> None:
+        if name == "demo_1":
+            entry["intrinsics"][0][0] *= 2
+
+    path = datasets.changed(datasets.LIFT, tmp_path, information(zoom))
+    with pytest.raises(CalibrationError, match="same K in every episode.* in demo_0 .* in demo_1"):
+        datasets.robosuite(path)
+    models = {"a": MODEL, "b": MODEL.replace('fovy="45"', 'fovy="46"')}
+    sizes = {"low": (640, 480), "high": (640, 480)}
+    with pytest.raises(CalibrationError, match="low: expected the same K"):
+        importers.from_models(models, [], sizes)
+    with h5py.File(tmp_path / "sensors.hdf5", "w") as file:
+        for number in range(2):
+            for key, value in sensor(intrinsic_cv=K + number * np.eye(3) * [1, 1, 0]).items():
+                file[f"traj_{number}/sensor_param/front/{key}"] = value[None]
+    with pytest.raises(CalibrationError, match="same K .* in traj_0 .* in traj_1"):
+        importers.from_maniskill(tmp_path / "sensors.hdf5", None, [], (640, 480))
 
 
 MODEL = """<mujoco><compiler meshdir="/nowhere"/><asset><mesh name="m" file="absent.stl"/></asset>

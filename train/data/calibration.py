@@ -5,7 +5,8 @@
     {"format": "palm-calib/1", "axes": "opencv",
      "cameras": {"front": {"K": 3x3, "width": 640, "height": 480, "dist": null,
                            "mount": "static", "flip": "none", "image": null,
-                           "T_base_cam": 4x4, "by_episode": {"demo_7": 4x4}}},
+                           "T_base_cam": 4x4, "by_episode": {"demo_7": 4x4},
+                           "off_centre": 0.15}},
      "T_ee_tcp": 4x4,
      "robot": {"pose": "robot0_eef_pos+robot0_eef_quat", "rotation": "quat_xyzw",
                "opening": "robot0_gripper_qpos", "closed": 0.0, "open": 0.04},
@@ -17,6 +18,8 @@
 - `K` is in pixels of a width x height image, (0, 0) the corner of the first pixel.
 - `flip` turns the stored images upright: none, ud, lr, 180, cw or ccw (a quarter turn).
 - `image` names the key of the camera's images where its own name does not tell.
+- `off_centre` is how far K's principal point may lie from the middle, as a share of the image:
+  further off, K is taken for that of another resolution. Cropped images need more.
 - `by_episode` holds the camera's pose in the episodes in which it was another one.
 - `T_ee_tcp` is the TCP in the frame of the recorded poses: origin between the finger pads, z the
   approach direction, y the opening axis (docs/conventions.md).
@@ -35,7 +38,14 @@ from typing import Any
 
 import numpy as np
 
-from palm_jax._checks import CameraError, PoseError, check_intrinsics, check_pose
+from palm_jax._checks import (
+    OFF_CENTRE,
+    CameraError,
+    PoseError,
+    check_centre,
+    check_intrinsics,
+    check_pose,
+)
 from palm_jax.align import Camera
 from palm_jax.align.lens import LENGTHS
 from palm_jax.train.data.errors import CalibrationError, CameraNameError, ImageSizeError
@@ -79,6 +89,8 @@ class CameraCalibration:
       flip: what turns the stored images upright, a key of `FLIPS`.
       image: key of the images in the data; None: found by the camera's name.
       by_episode: poses [4, 4] of the episodes in which it differs.
+      off_centre: how far the principal point may lie from the middle, as a share of the image:
+        further off, K is taken for that of another resolution (`Calibration` checks it).
 
     Raises:
       CalibrationError: a value that no camera has; the message names it.
@@ -93,6 +105,7 @@ class CameraCalibration:
     flip: str = "none"
     image: str | None = None
     by_episode: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    off_centre: float = OFF_CENTRE
 
     def __post_init__(self) -> None:
         where = f"cameras.{self.name}"
@@ -100,6 +113,10 @@ class CameraCalibration:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
                 raise CalibrationError(f"{where}.{name}: expected a number of pixels, got {value}")
+        if not (isinstance(self.off_centre, (int, float)) and self.off_centre >= 0):
+            raise CalibrationError(
+                f"{where}.off_centre: expected a share of the image, got {self.off_centre!r}"
+            )
         if self.flip not in FLIPS:
             raise CalibrationError(
                 f"{where}.flip: expected one of {', '.join(FLIPS)}; got {self.flip!r}"
@@ -121,13 +138,23 @@ class CameraCalibration:
             check_intrinsics(self.K, where)
         except CameraError as error:
             raise CalibrationError(str(error)) from error
-        u, v = float(self.K[0, 2]), float(self.K[1, 2])
-        if not (0 <= u <= self.width and 0 <= v <= self.height):
-            raise ImageSizeError(
-                f"{where}: expected the principal point inside the {self.width} x {self.height} "
-                f"image, got ({u:.1f}, {v:.1f}); K belongs to another resolution: give the size "
-                "that was calibrated (--size), and the size of the images with --rescale"
+
+    def check_centre(self) -> None:
+        """Raises where K is that of another resolution.
+
+        Raises:
+          ImageSizeError: the principal point is further off the middle than `off_centre`.
+        """
+        advice = (
+            "K belongs to another resolution: give the size that was calibrated (--size), and the "
+            "size of the images with --rescale; for images cropped to one side: --off-centre SHARE"
+        )
+        try:
+            check_centre(
+                self.K, self.height, self.width, self.off_centre, f"cameras.{self.name}.K", advice
             )
+        except CameraError as error:
+            raise ImageSizeError(str(error)) from error
 
     def camera(self, episode: str | None = None) -> Camera:
         """The pinhole camera of the upright, undistorted images of an episode."""
@@ -216,6 +243,8 @@ class Calibration:
     def __post_init__(self) -> None:
         if not self.cameras:
             raise CalibrationError("cameras: expected at least one, got none")
+        for camera in self.cameras.values():
+            camera.check_centre()
         _checked_pose(self.ee_to_tcp, "T_ee_tcp")
 
     def camera(self, name: str) -> CameraCalibration:
@@ -285,6 +314,7 @@ class Calibration:
                 "image": camera.image,
                 "T_base_cam": camera.cam_to_base,
                 "by_episode": camera.by_episode,
+                "off_centre": camera.off_centre,
             }
             for name, camera in self.cameras.items()
         }
@@ -418,6 +448,7 @@ def _camera(name: str, entry: Any) -> CameraCalibration:
             episode: _array(pose, f"{where}.by_episode.{episode}")
             for episode, pose in (entry.get("by_episode") or {}).items()
         },
+        off_centre=entry.get("off_centre", OFF_CENTRE),
     )
 
 

@@ -113,6 +113,8 @@ class Calibrate:
       pixel_origin: what (0, 0) is in K: the corner of the first pixel (renderers), or its centre
         (OpenCV's calibration), which is half a pixel away.
       flip: what turns the stored images upright.
+      off_centre: how far K's principal point may lie from the middle, as a share of the image, 0.15
+        unless told otherwise: more for images that were cropped to one side.
       rescale: width and height to which the images were resized since.
       image: key of the camera's images, where its name does not tell.
       pose: key of the hand's pose, KEY[a:b] or several joined with +.
@@ -140,6 +142,7 @@ class Calibrate:
     dist: str | None = None
     pixel_origin: Literal["corner", "centre"] = "corner"
     flip: Flip | None = None
+    off_centre: float | None = None
     rescale: tuple[int, int] | None = None
     image: str | None = None
     pose: str | None = None
@@ -246,10 +249,9 @@ def _changed(camera: CameraCalibration, config: Calibrate) -> CameraCalibration:
     changes: dict[str, Any] = {}
     if config.pixel_origin == "centre":
         changes["K"] = camera.K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    if config.flip is not None:
-        changes["flip"] = config.flip
-    if config.image is not None:
-        changes["image"] = config.image
+    for name in ("flip", "image", "off_centre"):
+        if getattr(config, name) is not None:
+            changes[name] = getattr(config, name)
     if config.dist is not None:
         numbers = importers.numbers_or_file(config.dist, "--dist").ravel()
         changes["dist"] = tuple(numbers.tolist())

@@ -82,8 +82,24 @@ def with_images(source: Source, names: Sequence[str]) -> list[str]:
     return found
 
 
-def _merged(name: str, K: np.ndarray, size: Size, poses: Mapping[str, np.ndarray]) -> Any:
-    """One camera from its pose in every episode."""
+def _merged(
+    name: str,
+    matrices: Mapping[str, np.ndarray],
+    size: Size,
+    poses: Mapping[str, np.ndarray],
+) -> CameraCalibration:
+    """One camera from its intrinsics and its pose in every episode.
+
+    Raises:
+      CalibrationError: the intrinsics differ.
+    """
+    first, K = next(iter(matrices.items()))
+    for episode, matrix in matrices.items():
+        if matrix.shape != K.shape or not np.allclose(matrix, K, rtol=_SAME, atol=_SAME):
+            raise CalibrationError(
+                f"{name}: expected the same K in every episode, got {K.tolist()} in {first} and "
+                f"{matrix.tolist()} in {episode}; split the file into those that share it"
+            )
     usual = next(iter(poses.values()))
     other = {episode: pose for episode, pose in poses.items() if np.abs(pose - usual).max() > _SAME}
     return CameraCalibration(name, K, *size, usual, by_episode=other)
@@ -121,8 +137,7 @@ def from_robosuite(source: Source, names: Sequence[str], size: Size | None) -> C
 
 
 def _camera_info(source: Source, name: str, size: Size | None) -> CameraCalibration:
-    poses = {}
-    matrix: np.ndarray | None = None
+    poses, matrices = {}, {}
     for episode in source.episodes:
         info = source.camera_info(episode)
         if name not in info:
@@ -132,13 +147,12 @@ def _camera_info(source: Source, name: str, size: Size | None) -> CameraCalibrat
             )
         if "eye_in_hand" in name:
             raise CalibrationError(f"{name}: a wrist camera moves with the TCP; PALM needs none")
-        matrix = matrix if matrix is not None else np.asarray(info[name]["intrinsics"], float)
+        matrices[episode] = np.asarray(info[name]["intrinsics"], float)
         poses[episode] = np.asarray(info[name]["extrinsics"], float)
-    assert matrix is not None
     size = size or image_size(source, name)
     if size is None:
         raise CameraNameError(f"{source.path}: no images of {name!r}; give their --size")
-    return _merged(name, matrix, size, poses)
+    return _merged(name, matrices, size, poses)
 
 
 # -- MuJoCo ----------------------------------------------------------------------------------------
@@ -168,17 +182,18 @@ def from_models(
 ) -> Cameras:
     """See `from_mujoco`, for one model an episode."""
     found: dict[str, dict[str, np.ndarray]] = {}
-    fovy: dict[str, float] = {}
+    fovy: dict[str, dict[str, float]] = {}
     for episode, xml in models.items():
         for name, (pose, angle) in _fixed_cameras(xml, names).items():
             found.setdefault(name, {})[episode] = pose @ AXES["opengl"]
-            fovy[name] = angle
+            fovy.setdefault(name, {})[episode] = angle
     cameras = {}
     for name, poses in found.items():
         size = sizes.get(name) or default
         if size is None:
             raise CalibrationError(f"{name}: give the size of its images: --size WIDTH HEIGHT")
-        cameras[name] = _merged(name, intrinsics_of(fovy[name], *size), size, poses)
+        matrices = {episode: intrinsics_of(angle, *size) for episode, angle in fovy[name].items()}
+        cameras[name] = _merged(name, matrices, size, poses)
     return cameras
 
 
@@ -267,9 +282,11 @@ Sensor = dict[str, dict[str, np.ndarray]]  # episode -> array name -> values
 
 
 def _sensor(name: str, episodes: Sensor, size: Size) -> CameraCalibration:
-    poses = {}
+    poses, matrices = {}, {}
     for episode, arrays in episodes.items():
         pose = None
+        if "intrinsic_cv" in arrays:
+            matrices[episode] = _still(arrays["intrinsic_cv"], f"{name}.intrinsic_cv")
         if "extrinsic_cv" in arrays:
             pose = inverted(_square(_still(arrays["extrinsic_cv"], f"{name}.extrinsic_cv")))
         if "cam2world_gl" in arrays:
@@ -283,10 +300,9 @@ def _sensor(name: str, episodes: Sensor, size: Size) -> CameraCalibration:
             pose = other if pose is None else pose
         if pose is not None:
             poses[episode] = pose
-    first = next(iter(episodes.values()))
-    if not poses or "intrinsic_cv" not in first:
+    if not poses or not matrices:
         raise CalibrationError(f"{name}: needs intrinsic_cv, and extrinsic_cv or cam2world_gl")
-    return _merged(name, _still(first["intrinsic_cv"], f"{name}.intrinsic_cv"), size, poses)
+    return _merged(name, matrices, size, poses)
 
 
 def _still(values: np.ndarray, where: str) -> np.ndarray:
@@ -403,7 +419,7 @@ def from_droid(
         if np.abs(vectors - vectors[0]).max() > 1e-4:
             raise CalibrationError(f"{key}: the camera moves in {episode}")
         poses[episode] = vector_pose(vectors[0], euler)
-    return {name: _merged(name, K, size, poses)}
+    return {name: _merged(name, {"": K}, size, poses)}
 
 
 def _extrinsics_key(source: Source, name: str) -> str:
