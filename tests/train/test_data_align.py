@@ -113,7 +113,8 @@ def test_against_slow_references(aligned: Path, episode: str) -> None:
     ends = [*tcp[1:], tcp[-1]]
     deltas = [oracles.delta(now, then) for now, then in zip(tcp, ends, strict=True)]
     np.testing.assert_allclose(got["palm_actions"][:, :9], deltas, atol=2e-5)
-    labels = oracles.gripper_labels(got["obs/palm_opening"])
+    # At 20 / 3 frames a second the gripper moves three times as far in a frame.
+    labels = oracles.gripper_labels(got["obs/palm_opening"], 0.06)
     np.testing.assert_array_equal(got["palm_actions"][:, 9], labels)
 
 
@@ -141,6 +142,28 @@ def test_labels_do_not_depend_on_the_padding(lift: Recording) -> None:
     over = aligning.labels(trajectory, transitions=1)
     np.testing.assert_array_equal(over[longest, :9], [1, 0, 0, 0, 1, 0, 0, 0, 0])
     assert (over[np.arange(len(over)) != longest] == every[np.arange(len(over)) != longest]).all()
+
+
+@pytest.mark.parametrize("rate", [10, 20, 60])
+def test_a_gripper_closes_in_a_second_at_any_rate(rate: int, tmp_path: Path) -> None:
+    """A file that says its rate, through `stream`: open, closing for a second, closed."""
+    assert aligning.PAPER_STEP * aligning.PAPER_RATE == pytest.approx(0.4)  # a second's
+    steps = np.clip(np.arange(3 * rate) - rate, 0, rate) / rate
+
+    def write(file: h5py.File) -> None:
+        file["data"].attrs["env_args"] = json.dumps({"env_kwargs": {"control_freq": rate}})
+        demo = file["data/demo_0"]
+        rows = np.resize(np.arange(15), 3 * rate)
+        for key in (datasets.IMAGES, "actions", "obs/robot0_eef_pos", "obs/robot0_eef_quat"):
+            datasets.replace(demo, key, demo[key][()][rows])
+        fingers = 0.04 * np.stack([1 - steps, steps - 1], 1)
+        datasets.replace(demo, "obs/robot0_gripper_qpos", fingers)
+
+    path = datasets.changed(datasets.LIFT, tmp_path, write)
+    with open_recording(path, datasets.robosuite(path)) as recording:
+        (found,) = aligning.stream(recording, SPEC, episodes=["demo_0"])
+    np.testing.assert_array_equal(found.actions[:rate, 9], 1)
+    np.testing.assert_array_equal(found.actions[rate:, 9], 0)
 
 
 @pytest.mark.parametrize("flip", ["ud", "lr", "180", "cw", "ccw"])

@@ -258,6 +258,14 @@ CASES: dict[str, Case] = {
             file["data/demo_0"], "obs/robot0_gripper_qpos", np.ones((31, 6))
         ),
     ),
+    "a gripper in other units": Case(
+        "OpeningError", ["from 0.02083 to", "0.001 for open: far outside", "--open VALUE", "--tr"],
+        calibrated={"opening": "robot0_gripper_qpos", "closed": 0.0, "open": 0.001},
+    ),
+    "a gripper that is never open": Case(
+        "OpeningError", ["with 0 for closed and 0.4 for open", "never half open", "--open VALUE"],
+        calibrated={"opening": "robot0_gripper_qpos", "closed": 0.0, "open": 0.4},
+    ),
     "no gripper": Case(
         "OpeningError", ["which key is the gripper", "--opening"],
         change=without("obs/robot0_gripper_qpos"),

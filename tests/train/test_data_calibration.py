@@ -26,7 +26,7 @@ from palm_jax.train.data.errors import (
     ImageSizeError,
     PoseDataError,
 )
-from palm_jax.train.data.recording import open_recording
+from palm_jax.train.data.recording import open_recording, range_problem
 from palm_jax.train.data.source import open_source
 
 POSE = oracles.looking_at(np.array([1.0, -0.4, 1.5]), np.array([0.2, 0.1, 0.8]))
@@ -567,6 +567,27 @@ def test_a_single_gripper_value_keeps_its_sign(
         with open_recording(path, told) as recording:
             got = recording.trajectory("demo_0").opening
         np.testing.assert_allclose(got, share, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("reach", "words"),
+    [
+        ((0.0, 1.0), ""), ((-0.1, 1.1), ""),
+        ((0.6, 1.0), ""),  # closes around something wide
+        ((0.0, 0.03), ""), ((0.0, 0.0), ""),  # closed throughout
+        ((0.3, 0.32), ""),  # holds something throughout
+        ((0.0, 0.1), "never half open"), ((0.05, 0.4), "never half open"),
+        ((0.0, 25.0), "far outside"), ((-1.0, 0.0), "far outside"),
+    ],
+)  # fmt: skip
+def test_ranges_of_a_gripper(reach: tuple[float, float], words: str) -> None:
+    for closed, opened in ((0.0, 0.04), (1.0, 0.0), (1.0, -1.0)):
+        keys = calib.RobotKeys("p", "matrix", "grip", closed, opened)
+        problem = range_problem(keys, reach)
+        assert words in problem and bool(words) == bool(problem)
+        if problem:
+            ends = sorted(closed + share * (opened - closed) for share in reach)
+            assert f"grip goes from {ends[0]:.4g} to {ends[1]:.4g}" in problem
 
 
 def test_sources_name_their_keys_and_columns() -> None:

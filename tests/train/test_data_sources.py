@@ -263,6 +263,7 @@ def test_inspection(lerobot: Path, tmp_path: Path) -> None:
 
     def spoil(file: h5py.File) -> None:
         demo = file["data/demo_0"]
+        demo["obs/robot0_gripper_qpos"][...] /= 5  # a smaller one than the Panda's
         demo["obs/robot0_eef_pos"][3] = np.nan
         for key in ("actions", datasets.IMAGES):
             datasets.replace(file["data/demo_1"], key, file["data/demo_1"][key][:1])
@@ -271,3 +272,4 @@ def test_inspection(lerobot: Path, tmp_path: Path) -> None:
         notes = inspection.inspect(file).notes
     assert any("demo_1 has 1 frame:" in note for note in notes)
     assert any("obs/robot0_eef_pos has NaN" in note for note in notes)
+    assert any("0.04 for open: it moves, but is never half open" in note for note in notes)

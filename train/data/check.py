@@ -94,6 +94,7 @@ def check(
     problem: DataError | None = None
     try:
         check_view(recording, survey, least=least)
+        recording.check_opening(survey)
         check_fit(recording, evidence, found)
     except DataError as error:
         problem = error

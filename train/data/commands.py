@@ -394,6 +394,8 @@ def _print_report(console: Console, recording: Recording, report: check.Report) 
         f"{survey.worst} ({survey.worst_share:.1%})",
         markup=False,
     )
+    low, high = survey.opening
+    console.print(f"gripper: {recording.keys.opening}, {low:.0%} to {high:.0%} open", markup=False)
     if report.reprojection is not None:
         error = report.reprojection
         console.print(
@@ -460,7 +462,8 @@ class Align:
         was there is kept as source_*.
       transitions: frames with so many largest motions of an episode become the identity.
       least_in_view: share of frames that must show the TCP.
-      trust: skip looking at the images, and at pixels measured in them, for a wrong calibration.
+      trust: skip looking at the images, at pixels measured in them and at the gripper's range for a
+        wrong calibration.
     """
 
     file: File

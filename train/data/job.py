@@ -81,14 +81,15 @@ def preflight(recording: Recording, *, least: float = LEAST_IN_VIEW, trust: bool
     Args:
       recording: the data with its calibration.
       least: share of frames that must show the TCP.
-      trust: do not look at the images, nor at measured pixels.
+      trust: do not look at the images, at measured pixels, nor at the gripper's range.
 
     Raises:
-      DataError: see `Recording.trajectory`, `check_view`, `check_fit`.
+      DataError: see `Recording.trajectory`, `check_view`, `Recording.check_opening`, `check_fit`.
     """
     survey = recording.survey()
     check_view(recording, survey, least=least)
     if not trust:
+        recording.check_opening(survey)
         check_fit(recording, motion.examine(recording), reprojection(recording))
     return survey
 

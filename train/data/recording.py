@@ -49,6 +49,13 @@ KNOWN_OPENINGS = {
 LEAST_IN_VIEW = 0.75
 """Share of frames that must show the TCP, unless told otherwise."""
 
+OUTSIDE = 0.25
+"""How far beyond closed and open a gripper's values may be, as a share of the range between."""
+
+STILL, HELD = 0.05, 0.2
+"""A gripper that is never further open, as a share of that range, is closed throughout; one that
+varies by less, as a share of its opening, holds something throughout."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Trajectory:
@@ -56,6 +63,7 @@ class Trajectory:
 
     tcp: np.ndarray  # [T, 4, 4] float64, base
     opening: np.ndarray  # [T] float64, 0 closed to 1 open
+    reach: tuple[float, float]  # least and most of the opening before it was limited to 0..1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,9 +74,9 @@ class Survey:
     frames: int
     in_view: float  # share of frames with the TCP in front of the camera, inside the image
     behind: float  # share with the TCP behind the camera
-    uv: tuple[np.ndarray, ...]  # one [T, 2] an episode, pixels; NaN behind the camera
     worst: str  # the episode with the smallest share in view
     worst_share: float
+    opening: tuple[float, float]  # least and most of the gripper, 0 closed to 1 open, not clipped
 
 
 def gripper_values(numbers: np.ndarray) -> np.ndarray:
@@ -142,7 +150,7 @@ class Recording:
                 f"palm_jax data repair {self.source.path} --calibration C --out NEW`, or mend it "
                 "where it was made"
             ) from error
-        return Trajectory(hand.tcp @ self.calibration.ee_to_tcp, hand.opening)
+        return dataclasses.replace(hand, tcp=hand.tcp @ self.calibration.ee_to_tcp)
 
     def survey(self, episodes: Iterable[str] | None = None) -> Survey:
         """Reads every pose and tells where the TCP appears.
@@ -151,21 +159,36 @@ class Recording:
           EpisodeLengthError, PoseDataError: see `trajectory`.
         """
         names = list(self.source.episodes if episodes is None else episodes)
-        uvs, shares = [], []
+        shares: list[float] = []
         behind = seen = frames = 0
+        reached: list[float] = []
         for name in names:
             camera = self.camera.camera(name)
-            uv, depth = projected(camera, self.trajectory(name).tcp[:, :3, 3])
+            hand = self.trajectory(name)
+            uv, depth = projected(camera, hand.tcp[:, :3, 3])
             visible = inside(camera, uv)
-            uvs.append(uv)
             shares.append(float(visible.mean()))
             behind += int((depth <= 1e-4).sum())
             seen, frames = seen + int(visible.sum()), frames + len(uv)
+            reached += hand.reach
         worst = int(np.argmin(shares))
         return Survey(
-            len(names), frames, seen / frames, behind / frames, tuple(uvs), names[worst],
-            shares[worst],
+            len(names), frames, seen / frames, behind / frames, names[worst], shares[worst],
+            (min(reached), max(reached)),
         )  # fmt: skip
+
+    def check_opening(self, survey: Survey) -> None:
+        """Raises where the gripper's values are not those between closed and open.
+
+        Raises:
+          OpeningError: see `range_problem`.
+        """
+        problem = range_problem(self.keys, survey.opening)
+        if problem:
+            raise OpeningError(
+                f"{self.source.path}: {problem}; change the calibration: `data calibrate --from "
+                "palm --file C --closed VALUE --open VALUE --out NEW` (--trust if you know better)"
+            )
 
 
 def robot_columns(source: Source, episode: str, keys: RobotKeys) -> tuple[np.ndarray, np.ndarray]:
@@ -209,13 +232,36 @@ def trajectory_of(
         raise PoseDataError(f"{keys.pose}: {_first_problem(poses)}") from None
     if not np.isfinite(gripper).all():
         raise PoseDataError(f"{keys.opening} has NaN or infinity")
-    return Trajectory(poses, np.clip(openness(keys, gripper), 0.0, 1.0))
+    opening = openness(keys, gripper)
+    reach = float(opening.min()), float(opening.max())
+    return Trajectory(poses, np.clip(opening, 0.0, 1.0), reach)
 
 
 def openness(keys: RobotKeys, gripper: np.ndarray) -> np.ndarray:
     """[T] of the gripper's columns [T, m]: 0 where it is as when closed, 1 as when open."""
     assert keys.closed is not None and keys.open is not None
     return (gripper_values(gripper) - keys.closed) / (keys.open - keys.closed)
+
+
+def range_problem(keys: RobotKeys, reach: tuple[float, float]) -> str:
+    """Why values of the gripper do not fit the range from closed to open, or an empty string.
+
+    Args:
+      keys: nothing left open.
+      reach: see `Trajectory`.
+    """
+    assert keys.closed is not None and keys.open is not None
+    low, high = reach
+    values = sorted(keys.closed + share * (keys.open - keys.closed) for share in reach)
+    found = (
+        f"{keys.opening} goes from {values[0]:.4g} to {values[1]:.4g}, with {keys.closed:g} for "
+        f"closed and {keys.open:g} for open"
+    )
+    if low < -OUTSIDE or high > 1 + OUTSIDE:
+        return f"{found}: far outside, all of it would count as closed or open"
+    if STILL < high < 0.5 and high - low > HELD * high:
+        return f"{found}: it moves, but is never half open, and would never count as open"
+    return ""
 
 
 def _check_episodes(source: Source, camera: CameraCalibration) -> None:
