@@ -18,7 +18,7 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from palm_jax.__main__ import main
-from palm_jax.train.data import calibration, output
+from palm_jax.train.data import calibration, output, verify
 from palm_jax.train.data.errors import DiskFullError
 from palm_jax.train.metrics import plain
 
@@ -116,6 +116,45 @@ def lerobot(**options: Any) -> Callable[[Path], Path]:
     return lambda folder: datasets.lerobot(folder, **options)
 
 
+def attribute(name: str, value: Any, place: str = "data") -> Change:
+    return lambda file: file[place].attrs.__setitem__(name, value)
+
+
+def described(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], Path]:
+    """A LeRobot set with another meta/info.json: changed in place, or what `change` returns."""
+
+    def make(folder: Path) -> Path:
+        root = datasets.lerobot(folder)
+        path = root / "meta" / "info.json"
+        content = json.loads(path.read_text())
+        other = change(content)
+        path.write_text(json.dumps(content if other is None else other))
+        return root
+
+    return make
+
+
+def feature(key: str, **entries: Any) -> Callable[[Path], Path]:
+    return described(lambda info: info["features"][key].update(entries))
+
+
+def listed(change: Callable[[dict[str, list[Any]]], Any]) -> Callable[[Path], Path]:
+    """A LeRobot set with another table meta/episodes."""
+
+    def make(folder: Path) -> Path:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        root = datasets.lerobot(folder)
+        path = root / "meta/episodes/chunk-000/file-000.parquet"
+        columns = pq.read_table(path).to_pydict()
+        change(columns)
+        pq.write_table(pa.table(columns), path)
+        return root
+
+    return make
+
+
 FRONT = {"name": "front", "pose": "observation.state[0:6]", "rotation": "euler_xyz"}
 FRONT |= {"opening": "observation.state[6]", "closed": 0.0, "open": 0.04}
 SIX = {"pose": "robot0_eef_pos+cube", "rotation": None}
@@ -138,6 +177,99 @@ CASES: dict[str, Case] = {
     "images damaged": Case(
         "TruncatedError", ["cannot be read", "data repair"],
         change=lambda file: damage(file["data/demo_0"][datasets.IMAGES]),
+    ),
+    # What files say of themselves.
+    "env_args that are cut": Case(
+        "FormatError", ["env_args: expected JSON, got {cut"], change=attribute("env_args", "{cut")
+    ),
+    "env_args that are a list": Case(
+        "FormatError", ["env_args: expected an object {...}, got [1]"],
+        change=attribute("env_args", "[1]"),
+    ),
+    "env_kwargs that are a text": Case(
+        "FormatError", ["env_kwargs: expected an object"],
+        change=attribute("env_args", '{"env_kwargs": "x"}'),
+    ),
+    "a rate that is a text": Case(
+        "FormatError", ["control_freq: expected frames a second, got fast"],
+        change=attribute("env_args", '{"env_kwargs": {"control_freq": "fast"}}'),
+    ),
+    "a rate of nothing": Case(
+        "FormatError", ["fps: expected frames a second, got 0"],
+        change=lambda file: [attribute("env_args", "{}")(file), attribute("fps", 0)(file)] and None,
+    ),
+    "a single action": Case(
+        "FormatError", ["demo_0: actions: expected an array with a row for each frame", "repair"],
+        change=lambda file: datasets.replace(file["data/demo_0"], "actions", np.float64(3)),
+    ),
+    "a number of frames that is a text": Case(
+        "FormatError", ["demo_0: num_samples: expected a whole number of at least 0, got many"],
+        change=lambda file: [
+            attribute("num_samples", "many", "data/demo_0")(file), without("actions")(file)
+        ] and None,
+    ),
+    "info.json that is a list": Case(
+        "FormatError", ["info.json: expected an object"], file=described(lambda info: [1])
+    ),
+    "info.json without a rate": Case(
+        "FormatError", ["info.json: fps: expected frames a second, got nothing"],
+        file=described(lambda info: info.pop("fps") and None),
+    ),
+    "info.json with no rate": Case(
+        "FormatError", ["fps: expected frames a second, got 0"],
+        file=described(lambda info: info.update(fps=0)),
+    ),
+    "info.json with a rate in words": Case(
+        "FormatError", ["fps: expected frames a second, got fast"],
+        file=described(lambda info: info.update(fps="fast")),
+    ),
+    "info.json without features": Case(
+        "FormatError", ["features: expected an object {...}, got nothing"],
+        file=described(lambda info: info.pop("features") and None),
+    ),
+    "a feature without a shape": Case(
+        "FormatError", ["features: action: expected a dtype, and a shape"],
+        file=feature("action", shape=None),
+    ),
+    "a feature without a type": Case(
+        "FormatError", ["features: action: expected a dtype, and a shape"],
+        file=feature("action", dtype=None),
+    ),
+    "a shape in words": Case(
+        "FormatError", ["features: action: expected a dtype, and a shape"],
+        file=feature("action", shape=["seven"]),
+    ),
+    "a feature of another width": Case(
+        "FormatError", ["observation.state: expected 8 numbers a frame", "episode 0"],
+        file=feature("observation.state", shape=[8]), calibrated=FRONT,
+    ),
+    "info.json without the place of the tables": Case(
+        "FormatError", ["data_path: expected a path with {chunk_index}", "got nothing"],
+        file=described(lambda info: info.pop("data_path") and None),
+    ),
+    "a place with other names": Case(
+        "FormatError", ["data_path: expected a path", "got data/{episode}"],
+        file=described(lambda info: info.update(data_path="data/{episode}")),
+    ),
+    "info.json without the place of the videos": Case(
+        "FormatError", ["video_path: expected a path with {chunk_index}"],
+        file=described(lambda info: info.update(video_path=None)),
+    ),
+    "episodes without a length": Case(
+        "FormatError", ["meta/episodes: row 0: length: expected a number", "got nothing"],
+        file=listed(lambda columns: columns.pop("length")),
+    ),
+    "episodes without a table": Case(
+        "FormatError", ["meta/episodes: row 0: data/chunk_index: expected a number"],
+        file=listed(lambda columns: columns.pop("data/chunk_index")),
+    ),
+    "episodes that begin nowhere": Case(
+        "FormatError", ["row 0: videos/observation.images.front/from_timestamp: expected"],
+        file=listed(lambda columns: columns.pop("videos/observation.images.front/from_timestamp")),
+    ),
+    "an episode that comes twice": Case(
+        "FormatError", ["expected each episode_index once"],
+        file=listed(lambda columns: columns.update(episode_index=[0, 0])),
     ),
     # Calibration.
     "missing calibration": Case(
@@ -302,6 +434,16 @@ CASES: dict[str, Case] = {
         "DataError", ["--crop", "128 x 128", "got 300"], options=("--crop", "300")
     ),
     "an image of no pixels": Case("OptionError", ["AlignSpec.size"], options=("--size", "0")),
+    **{
+        f"a spec with {text}": Case(
+            "DataError", ["--spec: ", "expected a value like"], options=("--spec", text)
+        )
+        for text in (
+            '{"axis_length": "x"}', '{"axis_length": null}', '{"offset": 3}',
+            '{"offset": ["a", 1]}', '{"overlay": "no"}', '{"crop": true}', '{"crop": 40.5}',
+            '{"thickness": NaN}',
+        )
+    },
     "more transitions than frames": Case(
         "EpisodeLengthError", ["transitions, got 99"], options=("--transitions", "99")
     ),
@@ -349,6 +491,41 @@ def test_bad_input(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
         assert part in message, message
     assert list(made.iterdir()) == [], "something half-written is left"
     assert datasets.digest(given) == before, "the input was touched"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "camera_info: expected JSON"),
+        ("[]", "camera_info: expected an object"),
+        ('{"agentview": 3}', "agentview: expected an object"),
+        ('{"agentview": {"intrinsics": [[1]]}}', "intrinsics: expected 3 x 3 finite numbers, got"),
+    ],
+)
+@pytest.mark.parametrize("command", ["inspect", "calibrate"])
+def test_camera_info_that_is_none(
+    command: str, text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is read where `data align` has the calibration already."""
+    change = attribute("camera_info", text, "data/demo_0")
+    path = str(datasets.changed(datasets.CAN, tmp_path, change))
+    more = ["--from", "robosuite", "--out", str(tmp_path / "new.json"), "--file"]
+    assert main(["data", command, *(more if command == "calibrate" else []), path]) == 2
+    message = capsys.readouterr().err
+    assert "error: FormatError: " in message and words in message
+
+
+def test_damaged_headers_are_reported_by_verify(tmp_path: Path) -> None:
+    """One episode's, among the others' problems; a total in words."""
+
+    def spoil(file: h5py.File) -> None:
+        datasets.replace(file["data/demo_1"], "actions", np.float64(3))
+        file["data"].attrs["total"] = "many"
+
+    problems = verify(datasets.changed(datasets.LIFT, tmp_path, spoil))
+    assert list(problems) == ["demo_1"] and "a row for each frame" in problems["demo_1"][0]
+    total = datasets.changed(datasets.CAN, tmp_path, attribute("total", "many"))
+    assert verify(total) == {"": ["total is many, not 31"]}
 
 
 # -- the disk --------------------------------------------------------------------------------------

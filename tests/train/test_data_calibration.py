@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -167,6 +168,17 @@ MIRROR = (POSE @ np.diag([1.0, -1.0, 1.0, 1.0])).tolist()
         ({"cameras__front__by_episode": {"a": MIRROR}}, CalibrationError, "by_episode.a"),
         ({"T_ee_tcp": MIRROR}, CalibrationError, "T_ee_tcp"),
         ({"robot": {"hand": 1}}, CalibrationError, "unknown entries hand"),
+        ({"robot": [1]}, CalibrationError, "robot: expected an object, got list"),
+        ({"robot": {"pose": 3}}, CalibrationError, "robot.pose: expected a text, got 3"),
+        ({"robot": {"rotation": "yaw"}}, CalibrationError, "robot.rotation: .*euler_xyz.* 'yaw'"),
+        ({"robot": {"closed": "a"}}, CalibrationError, "robot.closed: expected a finite number"),
+        ({"robot": {"open": math.nan}}, CalibrationError, "robot.open: expected a finite number"),
+        ({"cameras": [1]}, CalibrationError, "cameras: expected an object, got list"),
+        ({"cameras__front__flip": []}, CalibrationError, "none, ud, lr"),
+        ({"cameras__front__image": 5}, CalibrationError, "front.image: expected a key, got 5"),
+        ({"cameras__front__by_episode": [1]}, CalibrationError, "by_episode: expected an object"),
+        ({"cameras__front__mount": None}, CalibrationError, "mount: expected 'static', got None"),
+        ({"T_ee_tcp": None}, CalibrationError, "T_ee_tcp: expected finite"),
     ],
 )
 def test_what_is_refused(changes: dict, error: type, words: str, tmp_path: Path) -> None:
@@ -175,6 +187,26 @@ def test_what_is_refused(changes: dict, error: type, words: str, tmp_path: Path)
     with pytest.raises(error, match=words) as caught:
         calib.load(path)
     assert str(path) in str(caught.value) and isinstance(caught.value, CalibrationError)
+
+
+def test_every_entry_may_be_odd(tmp_path: Path) -> None:
+    """Whatever stands in a calibration.json: it is read, and can be used, or refused by name."""
+    whole = content(cameras__front__by_episode={"demo_0": POSE.tolist()}, robot__pose="tcp")
+    tried = refused = 0
+    for place, entry in datasets.spoiled(whole):
+        tried += 1
+        path = tmp_path / "calibration.json"
+        path.write_text(json.dumps(entry))
+        try:
+            found = calib.load(path)
+            for each in found.cameras.values():
+                each.camera("demo_0"), calib.image_key(each, ["front", "x"])
+            assert len(found.sha256) == 64
+        except CalibrationError:
+            refused += 1
+        except Exception as error:
+            raise AssertionError(place) from error
+    assert tried > 500 and refused > tried / 2
 
 
 def test_no_file_and_no_json(tmp_path: Path) -> None:

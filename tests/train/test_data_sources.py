@@ -13,6 +13,7 @@ import pytest
 
 from palm_jax.train.data import inspection, recording, source
 from palm_jax.train.data.errors import (
+    DataError,
     ExtraMissingError,
     FormatError,
     KeyMissingError,
@@ -230,6 +231,48 @@ def test_reading_lerobot_needs_nothing_but_the_extra() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, env=environment
     )
     assert run.stdout.strip() == "set()", run.stderr
+
+
+def test_every_entry_of_info_json_may_be_odd(tmp_path: Path) -> None:
+    """It is read, looked into and verified, or refused by name."""
+    root = datasets.lerobot(tmp_path)
+    path = root / "meta/info.json"
+    whole = json.loads(path.read_text())
+    tried = refused = 0
+    for place, entry in datasets.spoiled(whole):
+        tried += 1
+        path.write_text(json.dumps(entry))
+        try:
+            with open_source(root) as data:
+                inspection.inspect(data)
+                data.columns("1", "observation.state")
+        except DataError:
+            refused += 1
+        except Exception as error:
+            raise AssertionError(place) from error
+    assert tried > 300 and refused > tried / 4
+
+
+@pytest.mark.parametrize("attribute", ["data.env_args", "data/demo_0.camera_info"])
+def test_every_entry_of_a_robomimic_header_may_be_odd(attribute: str, tmp_path: Path) -> None:
+    place, name = attribute.split(".")
+    path = datasets.changed(datasets.CAN, tmp_path, lambda file: None)
+    with h5py.File(path) as file:
+        whole = json.loads(file[place].attrs[name])
+    refused = 0
+    for where, entry in datasets.spoiled(whole):
+        with h5py.File(path, "r+") as file:
+            file[place].attrs[name] = json.dumps(entry)
+        try:
+            with open_source(path) as data:
+                inspection.inspect(data)
+                assert data.task("demo_0")
+                datasets.robosuite(path)
+        except DataError:
+            refused += 1
+        except Exception as error:
+            raise AssertionError(where) from error
+    assert refused > 5
 
 
 def test_fingerprints_tell_files_apart(

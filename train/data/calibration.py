@@ -48,7 +48,9 @@ from palm_jax._checks import (
 )
 from palm_jax.align import Camera
 from palm_jax.align.lens import LENGTHS
+from palm_jax.train.data import rotations
 from palm_jax.train.data.errors import CalibrationError, CameraNameError, ImageSizeError
+from palm_jax.train.data.headers import is_number
 from palm_jax.train.metrics import plain, write_json
 
 FORMAT = "palm-calib/1"
@@ -113,11 +115,11 @@ class CameraCalibration:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
                 raise CalibrationError(f"{where}.{name}: expected a number of pixels, got {value}")
-        if not (isinstance(self.off_centre, (int, float)) and self.off_centre >= 0):
+        if not is_number(self.off_centre) or self.off_centre < 0:
             raise CalibrationError(
                 f"{where}.off_centre: expected a share of the image, got {self.off_centre!r}"
             )
-        if self.flip not in FLIPS:
+        if not isinstance(self.flip, str) or self.flip not in FLIPS:
             raise CalibrationError(
                 f"{where}.flip: expected one of {', '.join(FLIPS)}; got {self.flip!r}"
             )
@@ -126,6 +128,10 @@ class CameraCalibration:
                 f"{where}.dist: expected null or {', '.join(map(str, LENGTHS))} coefficients (k1, "
                 f"k2, p1, p2[, k3[, k4, k5, k6]]), got {len(self.dist)}"
             )
+        if self.dist is not None and not all(map(is_number, self.dist)):
+            raise CalibrationError(f"{where}.dist: expected finite numbers, got {self.dist}")
+        if self.image is not None and not isinstance(self.image, str):
+            raise CalibrationError(f"{where}.image: expected a key, got {self.image!r}")
         self._check_intrinsics(f"{where}.K")
         _checked_pose(self.cam_to_base, f"{where}.T_base_cam")
         for episode, pose in self.by_episode.items():
@@ -215,6 +221,9 @@ class RobotKeys:
       opening: key (or `key[a:b]`) of the gripper.
       closed, open: its value when closed and when open (the mean of the absolute values, if there
         are several).
+
+    Raises:
+      CalibrationError: a value of another kind.
     """
 
     pose: str | None = None
@@ -222,6 +231,21 @@ class RobotKeys:
     opening: str | None = None
     closed: float | None = None
     open: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("pose", "rotation", "opening"):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, str):
+                raise CalibrationError(f"robot.{name}: expected a text, got {value!r}")
+        for name in ("closed", "open"):
+            value = getattr(self, name)
+            if value is not None and not is_number(value):
+                raise CalibrationError(f"robot.{name}: expected a finite number, got {value!r}")
+        if self.rotation is not None and self.rotation not in rotations.NAMES:
+            raise CalibrationError(
+                f"robot.rotation: expected one of {', '.join(rotations.NAMES)}; got "
+                f"{self.rotation!r}"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -407,10 +431,8 @@ def from_json(content: Any) -> Calibration:
             f"axes: expected 'opencv' (x right, y down, z forward), got {content.get('axes')!r}; "
             "`data calibrate --axes opengl|coppelia` converts"
         )
-    cameras = content.get("cameras")
-    if not isinstance(cameras, dict):
-        raise CalibrationError(f"cameras: expected an object, got {type(cameras).__name__}")
-    robot = content.get("robot") or {}
+    cameras = _object(content.get("cameras"), "cameras")
+    robot = _object(content.get("robot") or {}, "robot")
     unknown = set(robot) - {field.name for field in dataclasses.fields(RobotKeys)}
     if unknown:
         raise CalibrationError(f"robot: unknown entries {', '.join(sorted(unknown))}")
@@ -424,8 +446,7 @@ def from_json(content: Any) -> Calibration:
 
 def _camera(name: str, entry: Any) -> CameraCalibration:
     where = f"cameras.{name}"
-    if not isinstance(entry, dict):
-        raise CalibrationError(f"{where}: expected an object, got {type(entry).__name__}")
+    entry = _object(entry, where)
     if entry.get("mount", "static") != "static":
         raise CalibrationError(
             f"{where}.mount: expected 'static', got {entry['mount']!r}; PALM aligns the images of "
@@ -446,10 +467,18 @@ def _camera(name: str, entry: Any) -> CameraCalibration:
         image=entry.get("image"),
         by_episode={
             episode: _array(pose, f"{where}.by_episode.{episode}")
-            for episode, pose in (entry.get("by_episode") or {}).items()
+            for episode, pose in _object(
+                entry.get("by_episode") or {}, f"{where}.by_episode"
+            ).items()
         },
         off_centre=entry.get("off_centre", OFF_CENTRE),
     )
+
+
+def _object(value: Any, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise CalibrationError(f"{where}: expected an object, got {type(value).__name__}")
+    return value
 
 
 def _array(value: Any, where: str) -> np.ndarray:

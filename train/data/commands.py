@@ -35,6 +35,7 @@ from palm_jax.train.data import aligning, check, importers, inspection, job, sou
 from palm_jax.train.data import calibration as calib
 from palm_jax.train.data.calibration import Calibration, CameraCalibration, RobotKeys
 from palm_jax.train.data.errors import CalibrationError, DataError, OutputError, disk_full
+from palm_jax.train.data.headers import is_number
 from palm_jax.train.data.recording import LEAST_IN_VIEW, Recording, open_recording
 from palm_jax.train.data.source import Source, open_source
 
@@ -518,10 +519,22 @@ def _spec_json(text: str | None) -> dict[str, Any]:
         content = json.loads(text if text.lstrip().startswith("{") else Path(text).read_text())
     except (OSError, ValueError) as error:
         raise DataError(f"--spec: expected JSON or a file of it ({error})") from error
-    known = {field.name for field in dataclasses.fields(AlignSpec)}
-    if not isinstance(content, dict) or not set(content) <= known:
+    known = {field.name: field.default for field in dataclasses.fields(AlignSpec)}
+    if not isinstance(content, dict) or not set(content) <= set(known):
         raise DataError(f"--spec: expected an object with some of {', '.join(sorted(known))}")
+    for name, value in content.items():
+        if not (_like(value, known[name]) or (name == "crop" and value is None)):
+            raise DataError(f"--spec: {name}: expected a value like {known[name]!r}, got {value!r}")
     return content
+
+
+def _like(value: Any, default: Any) -> bool:
+    """Whether a value of JSON is of a default's kind; a whole number is also a number."""
+    if isinstance(default, tuple):
+        return isinstance(value, list) and len(value) == len(default) and all(map(is_number, value))
+    if isinstance(default, float):
+        return is_number(value)
+    return type(value) is type(default)
 
 
 def run_align(config: Align, console: Console) -> int:
