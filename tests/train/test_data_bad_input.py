@@ -430,6 +430,10 @@ CASES: dict[str, Case] = {
         change=images(lambda i: np.concatenate([i, i[:3]])),
     ),
     # Options.
+    "all of it in another format": Case(
+        "OutputError", ["--keep all", "within one format"],
+        options=("--keep", "all", "--format", "lerobot"),
+    ),
     "a crop larger than the frame": Case(
         "DataError", ["--crop", "128 x 128", "got 300"], options=("--crop", "300")
     ),
@@ -633,5 +637,5 @@ def test_every_error_is_in_the_table() -> None:
         if isinstance(value, type) and issubclass(value, errors.DataError)
     }
     tested = {case.error for case in CASES.values()} | {"DiskFullError"}
-    # Without pyarrow: test_data_sources; an output that exists: test_data_align.
-    assert named - tested == {"ExtraMissingError", "OutputError"}
+    # Without pyarrow: test_data_sources.
+    assert named - tested == {"ExtraMissingError"}

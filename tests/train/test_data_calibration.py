@@ -264,6 +264,15 @@ def test_which_images_belong_to_a_camera() -> None:
     assert named.find(None, keys)[1] == "obs/other_image"
 
 
+def test_cameras_are_named_after_their_images(tmp_path: Path) -> None:
+    with open_source(datasets.LIFT) as source:
+        assert importers.with_images(source, []) == ["agentview"]
+    with open_source(datasets.lerobot(tmp_path)) as source:
+        assert importers.with_images(source, []) == ["front"]
+        assert importers.image_size(source, "front") == (128, 128)
+    assert calib.short_names("obs/_image") == {"obs/_image", "_image"}
+
+
 # -- importers -------------------------------------------------------------------------------------
 
 

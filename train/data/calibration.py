@@ -73,6 +73,17 @@ AXES = {
 """Camera axes of others -> what a pose with such axes is multiplied by, on the right."""
 
 
+def as_opencv(pose: np.ndarray, axes: str, inverse: bool) -> np.ndarray:
+    """A camera's poses in the base, OpenCV axes, out of what others store.
+
+    Args:
+      pose: [..., 4, 4].
+      axes: of its camera, a key of `AXES`.
+      inverse: it maps the base into the camera.
+    """
+    return (rotations.inverted(pose) if inverse else pose) @ AXES[axes]
+
+
 def turned(flip: str, width: int, height: int) -> tuple[int, int]:
     """Width and height of the images as stored, for an upright image of this size."""
     return (height, width) if flip in ("cw", "ccw") else (width, height)
@@ -367,7 +378,8 @@ def short_names(key: str) -> set[str]:
     last = key.split("/")[-1]
     for prefix in ("observation.images.", "observation.image.", "observation."):
         last = last.removeprefix(prefix)
-    return {key, last, *(last.removesuffix(end) for end in ("_image", "_rgb", ".image", ".rgb"))}
+    ends = ("_image", "_rgb", ".image", ".rgb")
+    return {key, last, *(last.removesuffix(end) for end in ends)} - {""}
 
 
 def image_key(camera: CameraCalibration, keys: Iterable[str]) -> str | None:

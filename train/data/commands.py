@@ -237,7 +237,7 @@ def _changed_pose(camera: CameraCalibration, config: Calibrate) -> CameraCalibra
         return camera
 
     def change(pose: np.ndarray) -> np.ndarray:
-        return (importers.inverted(pose) if config.inverse else pose) @ calib.AXES[config.axes]
+        return calib.as_opencv(pose, config.axes, config.inverse)
 
     return dataclasses.replace(
         camera,

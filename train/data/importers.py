@@ -19,7 +19,12 @@ import mujoco
 import numpy as np
 
 from palm_jax.train.data import rotations
-from palm_jax.train.data.calibration import AXES, CameraCalibration, image_key
+from palm_jax.train.data.calibration import (
+    CameraCalibration,
+    as_opencv,
+    image_key,
+    short_names,
+)
 from palm_jax.train.data.errors import (
     CalibrationError,
     CameraNameError,
@@ -36,16 +41,6 @@ Size = tuple[int, int]  # width, height
 
 # Poses of one camera that differ by less are the same: files store float32.
 _SAME = 1e-5
-
-
-def inverted(pose: np.ndarray) -> np.ndarray:
-    """The inverse of rigid poses [..., 4, 4]."""
-    rotation = np.swapaxes(pose[..., :3, :3], -1, -2)
-    result = np.zeros_like(pose)
-    result[..., :3, :3] = rotation
-    result[..., :3, 3] = -(rotation @ pose[..., :3, 3:])[..., 0]
-    result[..., 3, 3] = 1.0
-    return result
 
 
 def intrinsics_of(fovy: float, width: int, height: int) -> np.ndarray:
@@ -72,11 +67,7 @@ def with_images(source: Source, names: Sequence[str]) -> list[str]:
     """
     if names:
         return list(names)
-    found = [
-        name
-        for key in source.image_keys
-        for name in (key.split("/")[-1].removesuffix("_image").removesuffix("_rgb"),)
-    ]
+    found = [min(short_names(key), key=len) for key in source.image_keys]
     if not found:
         raise CameraNameError(f"{source.path} has no images; name the cameras with --camera")
     return found
@@ -185,7 +176,7 @@ def from_models(
     fovy: dict[str, dict[str, float]] = {}
     for episode, xml in models.items():
         for name, (pose, angle) in _fixed_cameras(xml, names).items():
-            found.setdefault(name, {})[episode] = pose @ AXES["opengl"]
+            found.setdefault(name, {})[episode] = as_opencv(pose, "opengl", False)
             fovy.setdefault(name, {})[episode] = angle
     cameras = {}
     for name, poses in found.items():
@@ -288,9 +279,11 @@ def _sensor(name: str, episodes: Sensor, size: Size) -> CameraCalibration:
         if "intrinsic_cv" in arrays:
             matrices[episode] = _still(arrays["intrinsic_cv"], f"{name}.intrinsic_cv")
         if "extrinsic_cv" in arrays:
-            pose = inverted(_square(_still(arrays["extrinsic_cv"], f"{name}.extrinsic_cv")))
+            pose = _square(_still(arrays["extrinsic_cv"], f"{name}.extrinsic_cv"))
+            pose = as_opencv(pose, "opencv", True)
         if "cam2world_gl" in arrays:
-            other = _still(arrays["cam2world_gl"], f"{name}.cam2world_gl") @ AXES["opengl"]
+            other = _still(arrays["cam2world_gl"], f"{name}.cam2world_gl")
+            other = as_opencv(other, "opengl", False)
             if pose is not None and np.abs(pose - other).max() > 1e-3:
                 raise CalibrationError(
                     f"{name}: extrinsic_cv (world to camera, OpenCV) and cam2world_gl (pose, "
@@ -441,7 +434,6 @@ def from_arrays(
     *,
     axes: str = "opencv",
     inverse: bool = False,
-    dist: Sequence[float] | None = None,
 ) -> Cameras:
     """From a matrix of intrinsics and one of extrinsics.
 
@@ -452,7 +444,6 @@ def from_arrays(
       size: of the images.
       axes: of the camera, a key of `calibration.AXES`.
       inverse: `pose` maps the base into the camera.
-      dist: lens coefficients, OpenCV's.
 
     Raises:
       CalibrationError: not such matrices.
@@ -460,10 +451,8 @@ def from_arrays(
     pose = np.asarray(pose, float)
     if pose.shape not in ((4, 4), (3, 4)):
         raise CalibrationError(f"--extrinsics: expected 4 x 4 or 3 x 4 numbers, got {pose.shape}")
-    pose = _square(pose)
-    pose = (inverted(pose) if inverse else pose) @ AXES[axes]
-    coefficients = None if dist is None else tuple(float(value) for value in dist)
-    return {name: CameraCalibration(name, np.asarray(K, float), *size, pose, coefficients)}
+    pose = as_opencv(_square(pose), axes, inverse)
+    return {name: CameraCalibration(name, np.asarray(K, float), *size, pose)}
 
 
 def numbers_or_file(text: str, where: str) -> np.ndarray:

@@ -18,8 +18,7 @@ import numpy as np
 
 from palm_jax.align import Camera, distort_points
 from palm_jax.train.data.aligning import BLOCK
-from palm_jax.train.data.calibration import AXES, FLIPS, CameraCalibration, turned
-from palm_jax.train.data.importers import inverted
+from palm_jax.train.data.calibration import AXES, FLIPS, CameraCalibration, as_opencv, turned
 from palm_jax.train.data.recording import Recording, inside, projected
 from palm_jax.train.data.rotations import about
 
@@ -102,7 +101,7 @@ def pose_as(pose: np.ndarray, reading: Reading) -> np.ndarray:
     if reading.euler is not None:
         pose = pose.copy()
         pose[:3, :3] = _reread(pose[:3, :3], reading.euler)
-    return (inverted(pose) if reading.inverse else pose) @ AXES[reading.axes]
+    return as_opencv(pose, reading.axes, reading.inverse)
 
 
 def camera_as(camera: CameraCalibration, episode: str, reading: Reading) -> Camera:
