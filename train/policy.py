@@ -31,7 +31,6 @@ from palm_jax.align import (
     Aligned,
     AlignSpec,
     Camera,
-    CameraError,
     DtypeError,
     OptionError,
     ProjectionError,
@@ -66,7 +65,6 @@ from palm_jax.train.learner import (
 IMAGE_SIZE = (480, 640)
 """Rows and columns of the images for which a policy is compiled unless told otherwise."""
 
-_OFF_CENTRE = 0.15  # a lens's optical axis meets its image within this share of the middle
 _OPENING_SLACK = 0.05  # a gripper's sensor may be off by this much beyond 0 and 1
 _LEAST_MARGIN = 0.05  # metres beyond the training's heights, where these hardly vary
 _MAX_SIZES = 8  # image sizes that are compiled for; a camera has one
@@ -259,7 +257,7 @@ class Policy:
         contract: Contract,
         *,
         zoom: float = 1.0,
-        off_centre: float = _OFF_CENTRE,
+        off_centre: float = _checks.OFF_CENTRE,
         noise_seed: int | None = None,
         dist: tuple[float, ...] | None = None,
     ) -> None:
@@ -501,14 +499,15 @@ class Policy:
     def _intrinsics(self, K: ArrayLike, height: int, width: int) -> NDArray[np.float64]:
         matrix = _array(K, "K", (3, 3), "the camera's intrinsics")
         _checks.check_intrinsics(matrix, "K")
-        for name, centre, size in (("cx", matrix[0, 2], width), ("cy", matrix[1, 2], height)):
-            if abs(centre / size - 0.5) > self._off_centre:
-                raise CameraError(
-                    f"K: expected a principal point near the middle of the {height} x {width} "
-                    f"image, got {name} = {centre:.1f} of {size}; K belongs to another image size: "
-                    "scale it with the image (Camera.scaled). For an image cut out of another one "
-                    "pass a larger off_centre to load"
-                )
+        _checks.check_centre(
+            matrix,
+            height,
+            width,
+            self._off_centre,
+            "K",
+            "K belongs to another image size: scale it with the image (Camera.scaled). For an "
+            "image cut out of another one pass a larger off_centre to load",
+        )
         return matrix
 
     def _check_height(self, height: float) -> None:
@@ -603,7 +602,7 @@ def load(
     *,
     image_size: tuple[int, int] | None = IMAGE_SIZE,
     zoom: float = 1.0,
-    off_centre: float = _OFF_CENTRE,
+    off_centre: float = _checks.OFF_CENTRE,
     noise_seed: int | None = None,
     dist: Sequence[float] | None = None,
 ) -> Policy:

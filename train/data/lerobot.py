@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from palm_jax.train.data import video
+from palm_jax.train.data import headers, video
 from palm_jax.train.data.errors import FormatError, KeyMissingError, TruncatedError
 from palm_jax.train.data.source import Feature, Source
 
@@ -41,6 +41,7 @@ class LeRobotSource(Source):
                 f"{path}: expected a LeRobot data set of version {CODEBASE}, got {version}; "
                 "convert it with lerobot's own converter"
             )
+        headers.lerobot_info(self.info, str(path / "meta" / "info.json"))
         self.fps = float(self.info["fps"])
         self._rows = self._episode_rows()
         self.episodes = tuple(self._rows)
@@ -49,10 +50,10 @@ class LeRobotSource(Source):
 
     def _json(self, name: str) -> dict[str, Any]:
         try:
-            content: dict[str, Any] = json.loads((self.path / name).read_text())
+            content = json.loads((self.path / name).read_text())
         except (OSError, ValueError) as error:
             raise FormatError(f"{self.path / name}: not readable ({error})") from error
-        return content
+        return headers.an_object(content, str(self.path / name))
 
     def _table(self, path: Path, columns: list[str] | None = None, **options: Any) -> Any:
         return self._whole(path, self._pq.read_table, columns=columns, **options)
@@ -78,6 +79,9 @@ class LeRobotSource(Source):
         for file in files:
             wanted = [name for name in self._names(file) if not name.startswith("stats/")]
             rows += self._table(file, wanted).to_pylist()
+        features = self.info["features"].items()
+        videos = [key for key, entry in features if entry["dtype"] == "video"]
+        headers.lerobot_rows(rows, videos, str(self.path / "meta" / "episodes"))
         rows.sort(key=lambda row: row["episode_index"])
         return {str(row["episode_index"]): row for row in rows}
 
@@ -128,10 +132,17 @@ class LeRobotSource(Source):
 
     def numbers(self, episode: str, key: str) -> np.ndarray:
         column = self.column(episode, key)
-        values = np.asarray(column.to_pylist())
-        if values.dtype.kind not in "biuf":
-            raise KeyMissingError(f"{self.path}: {key!r} holds no numbers")
-        return values.reshape(len(values), *self._features[key].shape)
+        shape = self._features[key].shape
+        try:
+            values = np.asarray(column.to_pylist())
+            if values.dtype.kind in "biuf":
+                return values.reshape(len(values), *shape)
+        except ValueError as error:
+            raise FormatError(
+                f"{self.path}: {key}: expected {' x '.join(map(str, shape)) or 1} numbers a frame, "
+                f"as meta/info.json says, got others in episode {episode} ({error})"
+            ) from error
+        raise KeyMissingError(f"{self.path}: {key!r} holds no numbers")
 
     def blocks(self, episode: str, key: str, size: int) -> Iterator[np.ndarray]:
         count = self.length(episode)
@@ -180,6 +191,22 @@ class LeRobotSource(Source):
         names = self._rows[episode].get("tasks") or list(self._tasks.values())
         return str(names[0]) if names else "unknown"
 
+    def _repaired(self, entry: str) -> dict[str, Any]:
+        """What `data repair` has noted; empty in other sets."""
+        try:
+            return dict(self._json("meta/palm.json")[entry])
+        except (FormatError, ValueError, TypeError, LookupError):
+            return {}
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        return frozenset(self._repaired("dropped"))
+
+    @property
+    def numbered_anew(self) -> dict[str, str]:
+        numbers = self._repaired("episodes")
+        return {old: str(new) for old, new in numbers.items() if old != new}
+
     def close(self) -> None:
         pass
 
@@ -192,7 +219,7 @@ def _feature(key: str, entry: dict[str, Any]) -> Feature:
     if dtype not in ("video", "image") or depth or len(shape) != 3:
         return Feature(() if shape == (1,) else shape, dtype)
     names = entry.get("names") or []
-    first = names[0] if isinstance(names, list) and names else ""
+    first = str(names[0]) if isinstance(names, list) and names else ""
     if first.startswith("channel") or (not first and shape[0] == 3):
         shape = (*shape[1:], shape[0])
     return Feature(shape, "uint8", images=shape[-1] == 3)

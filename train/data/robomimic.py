@@ -20,6 +20,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from palm_jax.train.data import headers
 from palm_jax.train.data.errors import FormatError, KeyMissingError, TruncatedError
 from palm_jax.train.data.source import Feature, Source
 
@@ -27,6 +28,9 @@ CACHE_BYTES = 64 * 2**20
 """For chunks that are larger than a block or cut frames into pieces."""
 
 DEFAULT_FPS = 20.0
+
+REPAIR = "palm_repair"
+"""Attribute of `data` in a file that `data repair` has written: what it left out, as JSON."""
 
 
 def _inflater() -> Any:
@@ -107,10 +111,16 @@ class RobomimicSource(Source):
         if not names:
             raise FormatError(f"{self.path}: no episode in 'data'")
         self.episodes = tuple(sorted(names, key=by_number))
-        self.env_args = json.loads(data.attrs.get("env_args", "{}"))
-        kwargs = self.env_args.get("env_kwargs") or {}
-        self.fps = float(kwargs.get("control_freq") or data.attrs.get("fps", DEFAULT_FPS))
+        self.env_args = headers.parsed(data.attrs.get("env_args", "{}"), f"{self.path}: env_args")
+        self.fps = self._rate()
         self._features = {key: _feature(dataset) for key, dataset in self.datasets(names[0])}
+
+    def _rate(self) -> float:
+        where = f"{self.path}: env_args: env_kwargs"
+        told = headers.an_object(self.env_args.get("env_kwargs") or {}, where).get("control_freq")
+        if told is not None:
+            return headers.rate(told, f"{where}: control_freq")
+        return headers.rate(self.data.attrs.get("fps", DEFAULT_FPS), f"{self.path}: fps")
 
     def _is_episode(self, name: str) -> bool:
         try:
@@ -148,19 +158,27 @@ class RobomimicSource(Source):
 
     def _dataset(self, episode: str, key: str) -> h5py.Dataset:
         try:
-            return self.demo(episode)[key]
+            dataset = self.demo(episode)[key]
         except KeyError:
             raise KeyMissingError(
                 f"{self.path}: {episode} has no {key!r}, which the first episode has; leave the "
                 "episode out with `data repair`"
             ) from None
+        if not isinstance(dataset, h5py.Dataset) or not dataset.shape:
+            raise FormatError(
+                f"{self.path}: {episode}: {key}: expected an array with a row for each frame, got "
+                f"{'a group' if isinstance(dataset, h5py.Group) else 'a single value'}; leave the "
+                "episode out with `data repair`"
+            )
+        return dataset
 
     def length(self, episode: str) -> int:
         demo = self.demo(episode)
         if "actions" in demo:
-            return len(demo["actions"])
+            return len(self._dataset(episode, "actions"))
         if "num_samples" in demo.attrs:
-            return int(demo.attrs["num_samples"])
+            where = f"{self.path}: {episode}: num_samples"
+            return headers.count(demo.attrs["num_samples"], where)
         return max((len(dataset) for _, dataset in self.datasets(episode)), default=0)
 
     def features(self) -> dict[str, Feature]:
@@ -252,7 +270,7 @@ class RobomimicSource(Source):
 
     def camera_info(self, episode: str) -> dict[str, dict[str, Any]]:
         text = self.demo(episode).attrs.get("camera_info")
-        return json.loads(text) if text else {}
+        return headers.camera_info(text, f"{self.path}: {episode}: camera_info") if text else {}
 
     def model_file(self, episode: str) -> str | None:
         text = self.demo(episode).attrs.get("model_file")
@@ -279,6 +297,13 @@ class RobomimicSource(Source):
             )
         train, valid = ([name for name in self.episodes if name in names] for names in named)
         return (train, valid) if train and valid else None
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        try:
+            return frozenset(json.loads(self.data.attrs.get(REPAIR, "{}"))["dropped"])
+        except (ValueError, TypeError, LookupError):
+            return frozenset()
 
     def close(self) -> None:
         if self._pool is not None:

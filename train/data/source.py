@@ -10,7 +10,7 @@ import abc
 import dataclasses
 import hashlib
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -88,6 +88,16 @@ class Source(abc.ABC):
     def task(self, episode: str) -> str:
         """What is done in the episode, in words."""
         return "unknown"
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        """Names of episodes that `data repair` did not take over into this file."""
+        return frozenset()
+
+    @property
+    def numbered_anew(self) -> Mapping[str, str]:
+        """Episode before a `data repair` -> its name now, where that is another one."""
+        return {}
 
     def split(self) -> tuple[list[str], list[str]] | None:
         """Episodes for training and for validation, where the file itself says so."""
