@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
+from palm_jax.train import pictures
 from palm_jax.train.data import video
 from palm_jax.train.data.errors import FormatError, KeyMissingError, TruncatedError
 from palm_jax.train.data.source import Feature, Source
@@ -164,9 +164,8 @@ class LeRobotSource(Source):
         content = item.get("bytes")
         source: Any = io.BytesIO(content) if content else self.path / str(item.get("path"))
         try:
-            with Image.open(source) as picture:
-                return np.asarray(picture.convert("RGB"))
-        except (OSError, ValueError) as error:
+            return pictures.rgb(source)
+        except ValueError as error:
             raise TruncatedError(f"{self.path}: an image that cannot be read ({error})") from error
 
     def image(self, episode: str, key: str, index: int) -> np.ndarray:
