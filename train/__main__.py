@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if devices.is_first():
             terminal.interrupted(console, configuration.resume_command(config))
         # What all processes agreed on ends all of them in order.
-        return 130 if isinstance(stop, training.Interrupted) else devices.leave(130)
+        return 130 if isinstance(stop, training.Interrupted) else interrupts.leave(stop)
     except Exception:
         if devices.alone():
             raise

@@ -381,9 +381,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, MemoryError) as error:
         console.print(f"error: {error}", markup=False)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         console.print("Stopped; the same command goes on with the batch that was running.")
-        return 130
+        return interrupts.leave(stop)
     if config.shard:
         return 0  # the report is for the one who joins the shards
     return report.main([str(config.run)])

@@ -379,7 +379,7 @@ def _outcome(process: subprocess.Popen[bytes]) -> int:
     """Waits for a cell. A signal is passed on: the cell saves, and goes on another time."""
     stop = interrupts.Stop("Stopping after the running cell has saved; once more ends at once.")
     try:
-        with stop.listening():
+        with stop.listening(at_once=process.kill):
             while process.poll() is None and not stop():
                 time.sleep(_POLL_S)
             if stop():
@@ -460,9 +460,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ConfigError, records.RecordError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         console.print("Stopped; the same command goes on with what is missing.")
-        return 130
+        return interrupts.leave(stop)
     failed = list(_cells_of(records.load_json(path), "failed")) if path.exists() else []
     words = f"; {len(failed)} cells failed" if failed else ""
     console.print(f"Results: {path}{words}", markup=False)

@@ -3,7 +3,6 @@
 import json
 import multiprocessing
 import os
-import signal
 import subprocess
 import sys
 import threading
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from palm_jax.train import interrupts, locks
+from palm_jax.train import locks
 
 ROOT = Path(__file__).resolve().parents[2]
 HOLDER = """
@@ -119,16 +118,3 @@ def test_waiting_is_told(tmp_path: Path) -> None:
         held.start()
         assert told.wait(10)
     held.join()
-
-
-def test_a_signal_is_noted_and_the_next_is_deadly() -> None:
-    before = signal.getsignal(signal.SIGTERM)
-    stop = interrupts.Stop()
-    with stop.listening():
-        assert not stop()
-        os.kill(os.getpid(), signal.SIGTERM)
-        assert stop() and signal.getsignal(signal.SIGINT) is signal.SIG_DFL
-    assert signal.getsignal(signal.SIGTERM) is before
-    with pytest.raises(KeyboardInterrupt), interrupts.raising():
-        os.kill(os.getpid(), signal.SIGTERM)
-    assert signal.getsignal(signal.SIGTERM) is before
