@@ -133,7 +133,7 @@ def execute(config: Recorded, console: Console) -> Path:
     devices.Split.over(jax.devices()).check(config.batch_size)
     assert config.data is not None and config.calibration is not None
     with (
-        locks.claim(out),
+        locks.claim(out, take_over=config.take_over),
         open_recording(config.data, config.calibration, camera=config.camera) as recording,
     ):
         return _execute(config, recording, out, console)
@@ -235,7 +235,8 @@ class _Job:
         config = dataclasses.replace(
             self.config, task=self.config.task or str(facts["recorded_task"])
         )
-        fields = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+        names = [f.name for f in dataclasses.fields(config) if f.name not in workspace.NOT_STORED]
+        fields = {name: getattr(config, name) for name in names}
         spec = dataclasses.asdict(self.spec)
         values: dict[str, Any] = plain(
             {

@@ -61,7 +61,7 @@ def execute(config: Config, console: Console) -> Path:
     if not devices.is_first():
         _take_part(config)
         return out
-    with locks.claim(out):
+    with locks.claim(out, take_over=config.take_over):
         return _execute(config, out, console)
 
 

@@ -272,8 +272,7 @@ def run(config: TableConfig, console: Console) -> Path:
                     _announce(console, cell, len(missing) - number, took)
                     _run_cell(config, cell, fresh, console, took)
         except locks.Busy as error:
-            hint = ", or call with --take-over" if error.elsewhere else ""
-            console.print(f"{cell.name} is left to another process: {error}{hint}", markup=False)
+            console.print(f"{cell.name} is left to another process: {error}", markup=False)
     return config.file
 
 
@@ -447,7 +446,8 @@ def _cells_of(table: dict[str, Any], part: str) -> Iterator[Cell]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command; returns the exit code."""
+    """The command; returns the exit code: 0, or 1 if cells failed, 2 for a command that cannot be
+    run, 3 if cells of the share are not done, 130 when interrupted."""
     config = tyro.cli(TableConfig, args=argv, prog="python -m palm_jax table")
     console = terminal.make_console()
     try:
@@ -463,7 +463,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as stop:
         console.print("Stopped; the same command goes on with what is missing.")
         return interrupts.leave(stop)
-    failed = list(_cells_of(records.load_json(path), "failed")) if path.exists() else []
+    return _summary(config, path, console)
+
+
+def _summary(config: TableConfig, path: Path, console: Console) -> int:
+    """Tells what has failed and what is not done; returns the exit code."""
+    table = records.load_json(path) if path.exists() else {}
+    failed = list(_cells_of(table, "failed"))
+    left = [] if config.merge else [c for c in cells(config) if _get(table, "results", c) is None]
+    left = [cell for cell in left if cell not in failed]
     words = f"; {len(failed)} cells failed" if failed else ""
+    words += f"; {len(left)} cells are left to other processes" if left else ""
     console.print(f"Results: {path}{words}", markup=False)
-    return 1 if failed else 0
+    return 1 if failed else locks.LEFT if left else 0

@@ -41,13 +41,13 @@ _FREE = ("out", "resume", "data", "calibration", "sweep", "videos", "method")
 RECORDED = "recorded"
 """What config.json says under "kind" of a run on recordings; nothing of one in the simulator."""
 
-_NOT_STORED = ("distributed",)
+NOT_STORED = ("distributed", "take_over")
 """Fields of the machines alone: no run folder holds them."""
 
 
 def stored(config: Config, method: str) -> dict[str, Any]:
     """What `config.json` of one method's run folder holds."""
-    names = [f.name for f in dataclasses.fields(Config) if f.name not in _NOT_STORED]
+    names = [f.name for f in dataclasses.fields(Config) if f.name not in NOT_STORED]
     values = {name: getattr(config, name) for name in names}
     low, high = shifts.TEST_LOW, shifts.TEST_HIGH
     regions = {
@@ -204,7 +204,7 @@ def stored_config(folder: Path) -> Config:
 def config_in(folder: Path, kind: type[AnyConfig]) -> AnyConfig:
     """What `config.json` holds, as the command saw it."""
     values = records.load_json(folder / "config.json")
-    names = [f.name for f in dataclasses.fields(kind) if f.name not in _NOT_STORED]
+    names = [f.name for f in dataclasses.fields(kind) if f.name not in NOT_STORED]
     missing = sorted(set(names) - set(values))
     if missing:
         raise ConfigError(f"{folder}/config.json lacks {', '.join(missing)}: another version's run")
