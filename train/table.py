@@ -31,9 +31,9 @@ from rich.console import Console
 
 from palm_jax.envs.registry import TASKS
 from palm_jax.envs.shifts import DOMAINS
+from palm_jax.train import compiled, interrupts, locks, methods, records, table_page, workspace
 from palm_jax.train import config as configuration
 from palm_jax.train import console as terminal
-from palm_jax.train import interrupts, locks, methods, records, table_page, workspace
 from palm_jax.train.config import Config, ConfigError
 from palm_jax.train.metrics import plain, write_json
 
@@ -367,7 +367,7 @@ def _train(config: Config, log: Path) -> int:
             [sys.executable, *words[1:]],
             stdout=output,
             stderr=subprocess.STDOUT,
-            env=_environment(config.data.parents[1]),
+            env=_environment(),
             close_fds=False,
             process_group=0,
         )
@@ -391,14 +391,19 @@ def _outcome(process: subprocess.Popen[bytes]) -> int:
     return code
 
 
-def _environment(folder: Path) -> dict[str, str]:
+def _environment() -> dict[str, str]:
     """The cells of a table share compiled programs; and memory in large pages, which glibc must be
-    told before a process begins, trains a fifth faster (docs/performance.md)."""
+    told before a process begins, trains a fifth faster (docs/performance.md).
+
+    Raises:
+      CacheError: see `compiled.folder`.
+    """
     ours = {
-        "JAX_COMPILATION_CACHE_DIR": str((folder / "compiled").resolve()),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
         "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
     }
+    if compiled.VARIABLE not in os.environ and (folder := compiled.folder()) is not None:
+        ours[compiled.VARIABLE] = str(folder)
     return {**ours, **os.environ}
 
 
@@ -457,7 +462,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         with interrupts.raising():
             path = run(config, console)
-    except (ConfigError, records.RecordError, OSError) as error:
+    except (ConfigError, compiled.CacheError, records.RecordError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as stop:

@@ -262,6 +262,7 @@ def test_a_signal_lets_the_running_cell_save(
         dataclasses.replace(SMALL, out=tmp_path), table.Cell("lift_lid", "palm", 0)
     )
     log = tmp_path / "cell.log"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(configuration, "command", lambda *_, **__: ["python", "-c", STUBBORN])
 
     def when_ready() -> None:
