@@ -27,8 +27,11 @@ def rgb(source: Path | BinaryIO, size: int | None = None) -> np.ndarray:
         with Image.open(source, formats=FORMATS) as picture:
             found = picture.convert("RGB")
             return np.asarray(found if size is None else found.resize((size, size)))
-    # Damaged PNG files end in a SyntaxError.
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    # Damaged PNG files end in a SyntaxError; too many pixels in an error, or a warning first.
+    except (
+        OSError, ValueError, SyntaxError, Image.DecompressionBombError,
+        Image.DecompressionBombWarning,
+    ) as error:  # fmt: skip
         words = f"not a whole picture of the kinds {', '.join(FORMATS)} ({error})"
         raise ValueError(words) from error
 

@@ -386,7 +386,7 @@ def _picture(jobs: Sequence[_Job], out: Path) -> None:
     for each in jobs:
         path = each.folder / "views.npz"
         if path.exists():
-            rows.append(list(records.load_arrays(path).values())[:_SHOWN])
+            rows.append(list(records.load_views(path).values())[:_SHOWN])
             names.append(paper.method_label(each.method.name))
     rows = [row for row in rows if len(row) == _SHOWN]
     if rows:

@@ -395,7 +395,7 @@ def _gallery(folders: dict[str, Path], out: Path, console: Console) -> None:
     for name, folder in folders.items():
         path = folder / "views.npz"
         try:
-            views = records.load_arrays(path) if path.exists() else {}
+            views = records.load_views(path) if path.exists() else {}
         except records.RecordError as error:
             console.print(f"{error}; left out of the gallery", markup=False)
             continue

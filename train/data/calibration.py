@@ -97,9 +97,10 @@ class CameraCalibration:
         where = f"cameras.{self.name}"
         for name in ("width", "height"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+            whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+            if not whole or not 1 <= value < 2**16:
                 raise CalibrationError(f"{where}.{name}: expected a number of pixels, got {value}")
-        if self.flip not in FLIPS:
+        if not isinstance(self.flip, str) or self.flip not in FLIPS:
             raise CalibrationError(
                 f"{where}.flip: expected one of {', '.join(FLIPS)}; got {self.flip!r}"
             )
@@ -331,7 +332,7 @@ def load(path: Path) -> Calibration:
             f"{path}: no such file; make one: `python -m palm_jax data calibrate --from robosuite|"
             f"mujoco|maniskill|droid|npy ... --out {path}`"
         ) from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise CalibrationError(f"{path}: not a readable JSON file ({error})") from error
     try:
         return from_json(content)
@@ -356,14 +357,10 @@ def from_json(content: Any) -> Calibration:
     cameras = content.get("cameras")
     if not isinstance(cameras, dict):
         raise CalibrationError(f"cameras: expected an object, got {type(cameras).__name__}")
-    robot = content.get("robot") or {}
-    unknown = set(robot) - {field.name for field in dataclasses.fields(RobotKeys)}
-    if unknown:
-        raise CalibrationError(f"robot: unknown entries {', '.join(sorted(unknown))}")
     return Calibration(
         {name: _camera(name, entry) for name, entry in cameras.items()},
         _array(content.get("T_ee_tcp", np.eye(4).tolist()), "T_ee_tcp"),
-        RobotKeys(**robot),
+        _robot(_object(content.get("robot"), "robot")),
         str(content.get("made_from", "")),
     )
 
@@ -380,7 +377,9 @@ def _camera(name: str, entry: Any) -> CameraCalibration:
     for key in ("K", "width", "height", "T_base_cam"):
         if entry.get(key) is None:
             raise CalibrationError(f"{where}.{key}: missing")
-    dist = entry.get("dist")
+    dist, image = entry.get("dist"), entry.get("image")
+    if not isinstance(image, str | None):
+        raise CalibrationError(f"{where}.image: expected a key of the data, got {image!r}")
     return CameraCalibration(
         name=name,
         K=_array(entry["K"], f"{where}.K"),
@@ -389,18 +388,39 @@ def _camera(name: str, entry: Any) -> CameraCalibration:
         cam_to_base=_array(entry["T_base_cam"], f"{where}.T_base_cam"),
         dist=None if dist is None else tuple(_array(dist, f"{where}.dist").ravel().tolist()),
         flip=entry.get("flip", "none"),
-        image=entry.get("image"),
+        image=image,
         by_episode={
             episode: _array(pose, f"{where}.by_episode.{episode}")
-            for episode, pose in (entry.get("by_episode") or {}).items()
+            for episode, pose in _object(entry.get("by_episode"), f"{where}.by_episode").items()
         },
     )
+
+
+def _robot(entry: Mapping[str, Any]) -> RobotKeys:
+    texts, numbers = ("pose", "rotation", "opening"), ("closed", "open")
+    unknown = set(entry) - {*texts, *numbers}
+    if unknown:
+        raise CalibrationError(f"robot: unknown entries {', '.join(sorted(unknown))}")
+    for name, value in entry.items():
+        if name in texts and not isinstance(value, str | None):
+            raise CalibrationError(f"robot.{name}: expected a text or null, got {value!r}")
+        if name in numbers and value is not None:
+            if isinstance(value, bool) or _array(value, f"robot.{name}").shape != ():
+                raise CalibrationError(f"robot.{name}: expected a number or null, got {value!r}")
+    return RobotKeys(**entry)
+
+
+def _object(value: Any, where: str) -> Mapping[str, Any]:
+    """A JSON object, empty for null."""
+    if not isinstance(value, dict | None):
+        raise CalibrationError(f"{where}: expected an object, got {type(value).__name__}")
+    return value or {}
 
 
 def _array(value: Any, where: str) -> np.ndarray:
     try:
         array = np.asarray(value, np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise CalibrationError(f"{where}: expected numbers ({error})") from error
     if not np.isfinite(array).all():
         raise CalibrationError(f"{where}: expected finite numbers")

@@ -16,7 +16,7 @@ import numpy as np
 from palm_jax.train import pictures
 from palm_jax.train.data import video
 from palm_jax.train.data.errors import FormatError, KeyMissingError, TruncatedError
-from palm_jax.train.data.source import Feature, Source
+from palm_jax.train.data.source import Feature, Source, checked_fps
 
 CODEBASE = "v3.0"
 
@@ -41,18 +41,46 @@ class LeRobotSource(Source):
                 f"{path}: expected a LeRobot data set of version {CODEBASE}, got {version}; "
                 "convert it with lerobot's own converter"
             )
-        self.fps = float(self.info["fps"])
+        self.fps = checked_fps(self.info.get("fps"), path)
+        self._check_names()
         self._rows = self._episode_rows()
         self.episodes = tuple(self._rows)
-        self._features = {key: _feature(key, entry) for key, entry in self.info["features"].items()}
+        self._features = self._described()
         self._tasks = self._task_names()
 
     def _json(self, name: str) -> dict[str, Any]:
         try:
-            content: dict[str, Any] = json.loads((self.path / name).read_text())
-        except (OSError, ValueError) as error:
+            content = json.loads((self.path / name).read_text())
+        except (OSError, ValueError, RecursionError) as error:
             raise FormatError(f"{self.path / name}: not readable ({error})") from error
+        if not isinstance(content, dict):
+            raise FormatError(f"{self.path / name}: expected a JSON object")
         return content
+
+    def _check_names(self) -> None:
+        """Raises FormatError for patterns of file names that are none."""
+        for name, given in (("data_path", {}), ("video_path", {"video_key": "key"})):
+            pattern = self.info.get(name)
+            if pattern is None and name == "video_path":
+                continue  # a data set without videos
+            try:
+                if not isinstance(pattern, str):
+                    raise TypeError("no text")
+                pattern.format(chunk_index=0, file_index=0, **given)
+            except (TypeError, ValueError, LookupError, AttributeError) as error:
+                raise FormatError(
+                    f"{self.path}/meta/info.json: {name}: expected the pattern of a file's name "
+                    f"with chunk_index and file_index, got {pattern!r:.80} ({error})"
+                ) from error
+
+    def _described(self) -> dict[str, Feature]:
+        try:
+            return {key: _feature(key, entry) for key, entry in self.info["features"].items()}
+        except (AttributeError, LookupError, TypeError, ValueError, OverflowError) as error:
+            raise FormatError(
+                f"{self.path}/meta/info.json: features: expected dtype and shape of every key "
+                f"({type(error).__name__}: {error})"
+            ) from error
 
     def _table(self, path: Path, columns: list[str] | None = None, **options: Any) -> Any:
         return self._whole(path, self._pq.read_table, columns=columns, **options)
@@ -128,10 +156,17 @@ class LeRobotSource(Source):
 
     def numbers(self, episode: str, key: str) -> np.ndarray:
         column = self.column(episode, key)
-        values = np.asarray(column.to_pylist())
+        shape = self._features[key].shape
+        try:
+            values = np.asarray(column.to_pylist()).reshape(self.length(episode), *shape)
+        except ValueError as error:
+            raise FormatError(
+                f"{self.path}: {key!r}: expected {shape} numbers a frame, as meta/info.json says "
+                f"({error})"
+            ) from error
         if values.dtype.kind not in "biuf":
             raise KeyMissingError(f"{self.path}: {key!r} holds no numbers")
-        return values.reshape(len(values), *self._features[key].shape)
+        return values
 
     def blocks(self, episode: str, key: str, size: int) -> Iterator[np.ndarray]:
         count = self.length(episode)
@@ -150,6 +185,8 @@ class LeRobotSource(Source):
     def video(self, episode: str, key: str) -> tuple[Path, float]:
         """The video file of an episode, and where in it the episode begins (seconds)."""
         row = self._rows[episode]
+        if f"videos/{key}/chunk_index" not in row or self.info.get("video_path") is None:
+            raise KeyMissingError(f"{self.path}: meta/episodes has no video of {key!r}")
         name = self.info["video_path"].format(
             video_key=key,
             chunk_index=row[f"videos/{key}/chunk_index"],
@@ -160,7 +197,9 @@ class LeRobotSource(Source):
             raise TruncatedError(f"{file}: missing; copy the data set again")
         return file, float(row[f"videos/{key}/from_timestamp"])
 
-    def _decoded(self, item: dict[str, Any]) -> np.ndarray:
+    def _decoded(self, item: Any) -> np.ndarray:
+        if not isinstance(item, dict):
+            raise KeyMissingError(f"{self.path}: a column of images holds none")
         content = item.get("bytes")
         source: Any = io.BytesIO(content) if content else self.path / str(item.get("path"))
         try:

@@ -21,7 +21,7 @@ import h5py
 import numpy as np
 
 from palm_jax.train.data.errors import FormatError, KeyMissingError, TruncatedError
-from palm_jax.train.data.source import Feature, Source
+from palm_jax.train.data.source import Feature, Source, checked_fps
 
 CACHE_BYTES = 64 * 2**20
 """For chunks that are larger than a block or cut frames into pieces."""
@@ -107,10 +107,23 @@ class RobomimicSource(Source):
         if not names:
             raise FormatError(f"{self.path}: no episode in 'data'")
         self.episodes = tuple(sorted(names, key=by_number))
-        self.env_args = json.loads(data.attrs.get("env_args", "{}"))
+        self.env_args = self._json(data.attrs.get("env_args", "{}"), "env_args")
         kwargs = self.env_args.get("env_kwargs") or {}
-        self.fps = float(kwargs.get("control_freq") or data.attrs.get("fps", DEFAULT_FPS))
+        if not isinstance(kwargs, dict):
+            raise FormatError(f"{self.path}: env_args: expected an object as env_kwargs")
+        fps = kwargs.get("control_freq") or data.attrs.get("fps", DEFAULT_FPS)
+        self.fps = checked_fps(fps, self.path)
         self._features = {key: _feature(dataset) for key, dataset in self.datasets(names[0])}
+
+    def _json(self, text: Any, name: str) -> dict[str, Any]:
+        """The object in an attribute."""
+        try:
+            found = json.loads(text)
+        except (TypeError, ValueError, RecursionError) as error:
+            raise FormatError(f"{self.path}: the attribute {name} is no JSON ({error})") from error
+        if not isinstance(found, dict):
+            raise FormatError(f"{self.path}: the attribute {name}: expected a JSON object")
+        return found
 
     def _is_episode(self, name: str) -> bool:
         try:
@@ -147,20 +160,21 @@ class RobomimicSource(Source):
         return found
 
     def _dataset(self, episode: str, key: str) -> h5py.Dataset:
-        try:
-            return self.demo(episode)[key]
-        except KeyError:
+        found = self.demo(episode).get(key)
+        if not isinstance(found, h5py.Dataset):
             raise KeyMissingError(
                 f"{self.path}: {episode} has no {key!r}, which the first episode has; leave the "
                 "episode out with `data repair`"
-            ) from None
+            )
+        return found
 
     def length(self, episode: str) -> int:
         demo = self.demo(episode)
-        if "actions" in demo:
-            return len(demo["actions"])
-        if "num_samples" in demo.attrs:
-            return int(demo.attrs["num_samples"])
+        actions, count = demo.get("actions"), demo.attrs.get("num_samples")
+        if isinstance(actions, h5py.Dataset) and actions.shape:
+            return len(actions)
+        if isinstance(count, int | np.integer):
+            return int(count)
         return max((len(dataset) for _, dataset in self.datasets(episode)), default=0)
 
     def features(self) -> dict[str, Feature]:
@@ -173,7 +187,7 @@ class RobomimicSource(Source):
     def _read(self, dataset: h5py.Dataset, rows: Any) -> np.ndarray:
         try:
             values: np.ndarray = dataset[rows]
-        except (OSError, RuntimeError) as error:
+        except (OSError, RuntimeError, ValueError, IndexError) as error:
             raise TruncatedError(
                 f"{self.path}: {dataset.name} cannot be read ({error}); save the whole episodes: "
                 f"`python -m palm_jax data repair {self.path} --out NEW`"
@@ -252,7 +266,7 @@ class RobomimicSource(Source):
 
     def camera_info(self, episode: str) -> dict[str, dict[str, Any]]:
         text = self.demo(episode).attrs.get("camera_info")
-        return json.loads(text) if text else {}
+        return {} if text is None else self._json(text, f"camera_info of {episode}")
 
     def model_file(self, episode: str) -> str | None:
         text = self.demo(episode).attrs.get("model_file")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import hashlib
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -165,6 +166,23 @@ class Source(abc.ABC):
     def fingerprint(self) -> dict[str, Any]:
         """Identifies the content: name, bytes, and a hash whose name says of what."""
         return fingerprint(self.path, self.files())
+
+
+def checked_fps(value: Any, path: Path) -> float:
+    """Frames a second, as a file says.
+
+    Raises:
+      FormatError: not a positive number.
+    """
+    try:
+        fps = float(value)
+    except (TypeError, ValueError, OverflowError):
+        fps = math.nan
+    if not 0 < fps < math.inf:
+        raise FormatError(
+            f"{path}: expected a positive number of frames a second, got {value!r:.80}"
+        )
+    return fps
 
 
 def fingerprint(path: Path, files: list[Path]) -> dict[str, Any]:
