@@ -128,7 +128,7 @@ def environment(config: Learning, *, wall_s: float) -> dict[str, Any]:
         "devices": [str(device) for device in jax.devices()],
         "versions": versions(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
-        "commit": _commit(),
+        "commit": commit(),
         "wall_s": round(wall_s, 1),
     }
 
@@ -157,7 +157,8 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def _commit() -> str | None:
+def commit() -> str | None:
+    """The commit of this very code, "-dirty" behind it if it was changed; None outside of git."""
     try:
         # Without cwd and close_fds Python spawns instead of forking, which JAX's threads forbid.
         found = subprocess.run(
