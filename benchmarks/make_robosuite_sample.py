@@ -121,27 +121,31 @@ def site_pixels(env: Any, states: np.ndarray, camera: str, size: int) -> np.ndar
     return pixels
 
 
-def play(env: Any, task: str, observation: dict, rng: np.random.Generator) -> Iterator[tuple]:
-    """Runs the plan; yields (observation before, action, reward, state before)."""
+def play(
+    env: Any, task: str, observation: dict, rng: np.random.Generator, *, near: bool = False
+) -> Iterator[tuple]:
+    """Runs the plan; yields (observation before, action, reward, state before); with `near`, from
+    where the hand is near the object on."""
     anchor = observation[OBJECTS[task]].copy()
     start = rng.uniform(-0.12, 0.12, 2)
     plan = [Stage(0.16, OPEN, 1, shift=(start[0], start[1])), *PLANS[task]]
     taken = 0
-    for stage in plan:
+    for number, stage in enumerate(plan):
         goal = anchor + np.array([*stage.shift, stage.height])
         stayed = 0
         while taken < LONGEST:
             error = goal - observation["robot0_eef_pos"]
-            near = float(np.linalg.norm(error)) < NEAR
-            stayed += near
-            if near and stayed >= stage.steps:
+            there = float(np.linalg.norm(error)) < NEAR
+            stayed += there
+            if there and stayed >= stage.steps:
                 break
             action = np.zeros(7)
             action[:3] = np.clip(GAIN * error / 0.4, -LIMIT, LIMIT)
             action[6] = stage.gripper
             state = env.sim.get_state().flatten()
             after, reward, _, _ = env.step(action)
-            yield observation, action, reward, state
+            if number > 0 or not near:
+                yield observation, action, reward, state
             observation, taken = after, taken + 1
 
 
@@ -191,17 +195,19 @@ def record(args: argparse.Namespace) -> None:
             }
         )
         for index in range(args.episodes):
-            # One environment an episode: MuJoCo's renderer leaves robosuite's own context unusable.
-            env = make(args.task, args.camera, args.size, 1000 * args.seed + index)
+            # MuJoCo's renderer leaves robosuite's own context unusable: then one an episode.
+            if args.pixels or index == 0:
+                env = make(args.task, args.camera, args.size, 1000 * args.seed + index)
             rng = np.random.default_rng([args.seed, index])
-            rows = list(play(env, args.task, env.reset(), rng))[:: args.every]
+            rows = list(play(env, args.task, env.reset(), rng, near=args.near))[:: args.every]
             demo = data.create_group(f"demo_{index}")
             write(demo, env, rows, args)
             heights = demo[f"obs/{OBJECTS[args.task]}"][:, 2]
             print(
                 f"demo_{index}: {len(rows)} frames, raised by {np.ptp(heights):.3f} m", flush=True
             )
-            env.close()
+            if args.pixels:
+                env.close()
         data.attrs["total"] = sum(int(demo.attrs["num_samples"]) for demo in data.values())
 
 
@@ -210,10 +216,7 @@ def write(demo: h5py.Group, env: Any, rows: list, args: argparse.Namespace) -> N
     observations, actions, rewards, states = zip(*rows, strict=True)
     image = f"{args.camera}_image"
     frames = np.stack([observation[image] for observation in observations])
-    pixels = site_pixels(env, np.stack(states), args.camera, args.size)
-    if args.upside_down:
-        pixels[:, 1] = args.size - pixels[:, 1]
-    else:
+    if not args.upside_down:
         frames = frames[:, ::-1]
     options: dict[str, Any] = {}
     if args.compression:
@@ -221,7 +224,11 @@ def write(demo: h5py.Group, env: Any, rows: list, args: argparse.Namespace) -> N
     demo.create_dataset(f"obs/{image}", data=frames, **options)
     for key in (*NUMBERS, OBJECTS[args.task]):
         demo[f"obs/{key}"] = np.stack([observation[key] for observation in observations])
-    demo[f"obs/{args.camera}_tcp_uv"] = pixels
+    if args.pixels:
+        pixels = site_pixels(env, np.stack(states), args.camera, args.size)
+        if args.upside_down:
+            pixels[:, 1] = args.size - pixels[:, 1]
+        demo[f"obs/{args.camera}_tcp_uv"] = pixels
     demo["actions"], demo["states"] = np.stack(actions), np.stack(states)
     demo["rewards"] = np.asarray(rewards)
     demo["dones"] = np.arange(len(rows)) == len(rows) - 1
@@ -238,7 +245,13 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=2)
     parser.add_argument("--size", type=int, default=128, help="pixels per side")
     parser.add_argument("--every", type=int, default=1, help="keep every n-th control step")
+    parser.add_argument(
+        "--near", action="store_true", help="begin where the hand is near the object"
+    )
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--no-pixels", dest="pixels", action="store_false", help="do not measure CAMERA_tcp_uv"
+    )
     parser.add_argument("--upside-down", action="store_true", help="as robosuite renders them")
     parser.add_argument("--compression", choices=("gzip", "lzf"), default=None)
     parser.add_argument("--out", type=Path, required=True)

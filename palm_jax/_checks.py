@@ -197,3 +197,25 @@ def check_intrinsics(intrinsics: Any, name: str) -> None:
             f"{name}: expected the last row (0, 0, 1), got {matrix[..., 2, :].tolist()}; "
             "divide K by K[2, 2], and do not pass K transposed"
         )
+
+
+OFF_CENTRE = 0.15
+"""A lens's optical axis meets its image within this share of the middle."""
+
+
+def check_centre(K: Any, height: int, width: int, most: float, name: str, advice: str) -> None:
+    """Raise CameraError unless K is that of a height x width image, as far as its centre tells.
+
+    Args:
+      K: [3, 3].
+      height, width: pixels.
+      most: how far the principal point may lie from the middle, as a share of the image.
+      name: of K.
+      advice: what to do, for the message.
+    """
+    for axis, centre, size in (("cx", K[0, 2], width), ("cy", K[1, 2], height)):
+        if abs(centre / size - 0.5) > most:
+            raise CameraError(
+                f"{name}: expected a principal point near the middle of the image, got {axis} = "
+                f"{centre:.1f} of {size}; {advice}"
+            )

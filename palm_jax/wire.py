@@ -70,7 +70,11 @@ def _decode(entry: dict[Any, Any]) -> Any:
         value = entry.get(b"data")
         if not isinstance(value, (bool, int, float)):
             raise WireError(f"a scalar needs a number, got a {type(value).__name__}")
-        return _dtype(entry).type(value)
+        dtype = _dtype(entry)
+        try:
+            return dtype.type(value)
+        except (OverflowError, ValueError) as error:
+            raise WireError(f"a scalar of {dtype} cannot be {value!r}") from error
     if b"__ndarray__" not in entry:
         return entry
     dtype, data, shape = _dtype(entry), entry.get(b"data"), entry.get(b"shape")

@@ -1,10 +1,11 @@
 """Data files for tests: robosuite's recordings, changed copies of them, and a LeRobot data set made
 with pyarrow and PyAV alone."""
 
+import copy
 import hashlib
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,27 @@ def digest(path: Path) -> str:
         if file.is_file():
             content.update(f"{file.name} {file.stat().st_mtime_ns}".encode() + file.read_bytes())
     return content.hexdigest()
+
+
+ODD = (None, [], {}, "x", -1, 1e400, True, [[1]], {"a": 1})
+"""What no entry of a file means, or few."""
+
+
+def spoiled(content: Any) -> Iterator[tuple[str, Any]]:
+    """JSON with each of its entries in turn left out or replaced by something odd, and where."""
+    if not isinstance(content, (dict, list)):
+        return
+    for key in content if isinstance(content, dict) else range(len(content)):
+        for odd in ODD:
+            other = copy.copy(content)
+            other[key] = odd
+            yield f"{key} = {odd}", other
+        if isinstance(content, dict):
+            yield f"no {key}", {k: v for k, v in content.items() if k != key}
+        for place, inner in spoiled(content[key]):
+            other = copy.copy(content)
+            other[key] = inner
+            yield f"{key}.{place}", other
 
 
 def lerobot(folder: Path, *, fps: int = 20, short_video: int = 0) -> Path:

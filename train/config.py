@@ -218,7 +218,8 @@ class Recorded(Learning):
         taken); by default the file's own split (robomimic's filter keys train and valid), else a
         tenth.
       least_in_view: share of frames that must show the TCP.
-      trust: skip looking at the images for a wrong calibration.
+      trust: skip looking at the images, at pixels measured in them and at the gripper's range for a
+        wrong calibration.
     """
 
     task: str = ""

@@ -141,6 +141,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns the exit code."""
     config = tyro.cli(ExportConfig, args=argv, prog="python -m palm_jax export")
     console = terminal.make_console()
+    wanted = [config.out, *(_beside(config.out, suffix) for suffix in (".jax", ".json"))]
+    taken = [path for path in wanted if path.exists()]
+    if taken:
+        print(f"error: {taken[0]} exists: move it, or choose another --out", file=sys.stderr)
+        return 2
     try:
         console.print(f"Loading {config.run} ...", markup=False)
         policy = load(config.run, image_size=None, zoom=config.zoom)

@@ -662,11 +662,14 @@ def make_learner(
 def to_action(prediction: jax.Array) -> jax.Array:
     """Denormalised prediction [..., 10] -> executable action [..., 10].
 
-    The rotation's two columns become orthonormal (Gram-Schmidt), the gripper 0 or 1.
+    The rotation's two columns become orthonormal (Gram-Schmidt), the gripper 0 or 1. A prediction
+    with a number that is not finite becomes all NaN: neither step would let it be seen.
     """
     rotation = align.rotation_6d(align.matrix_from_6d(prediction[..., ROTATION]))
     gripper = (prediction[..., GRIPPER:] > GRIPPER_THRESHOLD).astype(prediction.dtype)
-    return jnp.concatenate([rotation, prediction[..., ROTATION.stop : GRIPPER], gripper], axis=-1)
+    action = jnp.concatenate([rotation, prediction[..., ROTATION.stop : GRIPPER], gripper], axis=-1)
+    finite = jnp.isfinite(prediction).all(axis=-1, keepdims=True)
+    return jnp.where(finite, action, jnp.nan)
 
 
 def check_batch(batch: Batch, proprio_dim: int, views: Sequence[str], crop: int | None) -> int:

@@ -14,9 +14,10 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
+import sys
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,15 +31,16 @@ from palm_jax.align import (
     Aligned,
     AlignSpec,
     Camera,
-    CameraError,
     DtypeError,
     OptionError,
     ProjectionError,
     ShapeError,
     align_like,
     apply_delta,
+    undistort,
 )
 from palm_jax.align.camera import check_tcp_in_view
+from palm_jax.align.lens import LENGTHS
 from palm_jax.align.proprio import LAYOUTS
 from palm_jax.envs.base import (
     CAMERA_FOVY,
@@ -63,7 +65,6 @@ from palm_jax.train.learner import (
 IMAGE_SIZE = (480, 640)
 """Rows and columns of the images for which a policy is compiled unless told otherwise."""
 
-_OFF_CENTRE = 0.15  # a lens's optical axis meets its image within this share of the middle
 _OPENING_SLACK = 0.05  # a gripper's sensor may be off by this much beyond 0 and 1
 _LEAST_MARGIN = 0.05  # metres beyond the training's heights, where these hardly vary
 _MAX_SIZES = 8  # image sizes that are compiled for; a camera has one
@@ -256,10 +257,12 @@ class Policy:
         contract: Contract,
         *,
         zoom: float = 1.0,
-        off_centre: float = _OFF_CENTRE,
+        off_centre: float = _checks.OFF_CENTRE,
         noise_seed: int | None = None,
+        dist: tuple[float, ...] | None = None,
     ) -> None:
         """See `load`, which checks what is given here."""
+        self._dist = dist
         self.contract, self.zoom = contract, zoom
         self._learner, self.state, self._off_centre = learner, state, off_centre
         self._noise = None if noise_seed is None else jax.random.key(noise_seed)
@@ -297,8 +300,8 @@ class Policy:
         """The next target of the TCP, to be reached within 1 / `contract.rate` seconds.
 
         Args:
-          image: uint8 [H, W, 3], RGB, the camera's whole image, lens distortion removed. The first
-            image of another size than `load` was told of takes seconds.
+          image: uint8 [H, W, 3], RGB, the camera's whole image, upright; lens distortion removed
+            unless `load` was told of it. The first of another size than `load` knows takes seconds.
           K: [3, 3] intrinsics in pixels of this image.
           cam_to_world: [4, 4] pose of the camera, OpenCV axes (x right, y down, z forward).
           tcp: [4, 4] pose of the TCP (z the direction of approach, y the opening axis), in the same
@@ -427,6 +430,8 @@ class Policy:
         opening: jax.Array,
         mask: jax.Array | None,
     ) -> tuple[Aligned, jax.Array]:
+        if self._dist is not None:
+            image = undistort(image, K, np.asarray(self._dist, np.float32))
         return align_like(
             image,
             Camera(K, cam_to_world, *image.shape[:2]),
@@ -494,14 +499,15 @@ class Policy:
     def _intrinsics(self, K: ArrayLike, height: int, width: int) -> NDArray[np.float64]:
         matrix = _array(K, "K", (3, 3), "the camera's intrinsics")
         _checks.check_intrinsics(matrix, "K")
-        for name, centre, size in (("cx", matrix[0, 2], width), ("cy", matrix[1, 2], height)):
-            if abs(centre / size - 0.5) > self._off_centre:
-                raise CameraError(
-                    f"K: expected a principal point near the middle of the {height} x {width} "
-                    f"image, got {name} = {centre:.1f} of {size}; K belongs to another image size: "
-                    "scale it with the image (Camera.scaled). For an image cut out of another one "
-                    "pass a larger off_centre to load"
-                )
+        _checks.check_centre(
+            matrix,
+            height,
+            width,
+            self._off_centre,
+            "K",
+            "K belongs to another image size: scale it with the image (Camera.scaled). For an "
+            "image cut out of another one pass a larger off_centre to load",
+        )
         return matrix
 
     def _check_height(self, height: float) -> None:
@@ -596,8 +602,9 @@ def load(
     *,
     image_size: tuple[int, int] | None = IMAGE_SIZE,
     zoom: float = 1.0,
-    off_centre: float = _OFF_CENTRE,
+    off_centre: float = _checks.OFF_CENTRE,
     noise_seed: int | None = None,
+    dist: Sequence[float] | None = None,
 ) -> Policy:
     """The policy of a finished run, ready to act: its best checkpoint by in-domain success, with
     the averaged parameters, as in the run's own evaluation.
@@ -613,6 +620,10 @@ def load(
         size; a K of another image size is found out by it.
       noise_seed: add the noise on proprioception that evaluations add, drawn from this seed; None
         for none, and equal actions for equal inputs.
+      dist: lens coefficients of the camera (OpenCV's 4, 5 or 8), to give `act` its images as they
+        are; they are undistorted in the same compiled call. None for images without distortion.
+
+    Prints how long an action takes, to standard error, if it compiles here.
 
     Raises:
       PolicyError: no run, several runs, no whole and scored checkpoint, parameters that are not
@@ -625,6 +636,10 @@ def load(
         raise PolicyError(f"off_centre: expected a share of the image, got {off_centre}")
     if image_size is not None and min(image_size) < 1:
         raise PolicyError(f"image_size: expected rows and columns, got {image_size}")
+    if dist is not None and (len(dist) not in LENGTHS or not np.isfinite(dist).all()):
+        raise PolicyError(
+            f"dist: expected {', '.join(map(str, LENGTHS))} finite lens coefficients, got {dist}"
+        )
     _check_one_run(folder)
     try:
         values = records.load_json(folder / "config.json")
@@ -646,11 +661,20 @@ def load(
         raise PolicyError(f"{path}: the parameters are not finite; train again")
     contract = dataclasses.replace(contract, heights=_heights(contract.spec, state))
     policy = Policy(
-        learner, state, contract, zoom=zoom, off_centre=off_centre, noise_seed=noise_seed
+        learner,
+        state,
+        contract,
+        zoom=zoom,
+        off_centre=off_centre,
+        noise_seed=noise_seed,
+        dist=None if dist is None else tuple(map(float, dist)),
     )
     if image_size is not None:
         took = policy.warm_up(*image_size)
-        _log.info("%s: %.1f ms an action for images of %d x %d", folder, took, *image_size)
+        height, width = image_size
+        print(
+            f"{folder}: {took:.1f} ms an action for images of {height} x {width}", file=sys.stderr
+        )
     return policy
 
 

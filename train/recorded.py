@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ from palm_jax.train import (
 from palm_jax.train import console as terminal
 from palm_jax.train.config import ConfigError, Recorded, default_out
 from palm_jax.train.data import aligning, job
-from palm_jax.train.data.errors import disk_full
+from palm_jax.train.data.errors import TcpOutOfViewError, disk_full
 from palm_jax.train.data.recording import Recording, Survey, open_recording
 from palm_jax.train.evaluate import VIEW
 from palm_jax.train.metrics import plain, write_json
@@ -160,7 +160,7 @@ def _execute(config: Recorded, recording: Recording, out: Path, console: Console
         _note_environment(config, each.folder, time.monotonic() - began)
     _picture(jobs, out)
     report.write_report(out)
-    terminal.held_out(console, {name: entry for name, entry in found.items() if entry})
+    terminal.held_out(console, {n: entry for n, entry in found.items() if "loss" in entry})
     console.print(
         f"Report: {out / 'report.html'}   ({terminal.duration(time.monotonic() - start)})",
         markup=False,
@@ -250,8 +250,8 @@ class _Job:
         return values
 
     def perform(self, facts: Mapping[str, Any], console: Console) -> dict[str, Any]:
-        """Trains, and tells how good the chosen checkpoint is on what was held out; empty if
-        nothing was."""
+        """Trains, and gives what `held_out.json` holds: how good the chosen checkpoint is on what
+        was held out."""
         name = self.method.name
         path = self.folder / records.HELD_OUT
         if path.exists():
@@ -269,8 +269,9 @@ class _Job:
                 found = held_out.measure(model, policy, checked) if len(checked.proprio) else {}
             self._note_views(data)
         # Written last: its presence says that the method is finished.
-        write_json(path, {"step": step, "episodes": len(self.split.held_out), **found})
-        return found
+        values = {"step": step, "episodes": len(self.split.held_out), **found}
+        write_json(path, values)
+        return values
 
     def _training(
         self, model: learner.Learner, belongs: str, checked: learner.Batch
@@ -296,8 +297,7 @@ class _Job:
         source = self.recording.source
         total = sum(source.length(name) for name in episodes)
         size, count = self.spec.size, 0
-        numbers: dict[str, list[np.ndarray]] = {"proprio": [], "actions": [], "tcp": []}
-        cameras: list[Camera] = []
+        parts: list[_Numbers] = []
         with _room((total, size, size, 3), self.folder) as images:
             with terminal.ProgressBar(
                 console, total, f"align {self.method.name}, {label}", unit="frame"
@@ -311,12 +311,32 @@ class _Job:
                     shown = episode.valid
                     images[count : count + shown.sum()] = episode.images[shown]
                     count += int(shown.sum())
-                    numbers["proprio"].append(episode.proprio[shown])
-                    numbers["actions"].append(episode.actions[shown])
-                    numbers["tcp"].append(episode.tcp[shown, :3, 3])
-                    cameras.append(_window_cameras(episode.camera, episode.tcp[shown], self.spec))
+                    parts.append(_Numbers.of(episode))
                     bar.advance(len(shown))
-            yield _batch(images[:count], numbers, cameras, self.spec)
+            if episodes and not count:
+                raise TcpOutOfViewError(
+                    f"{source.path}: no frame of {', '.join(episodes[:5])} shows the TCP; another "
+                    "--validation share, or leave these episodes out"
+                )
+            yield self._batch(images[:count], parts)
+
+    def _batch(self, images: np.ndarray, parts: Sequence["_Numbers"]) -> learner.Batch:
+        if not parts:
+            empty = np.zeros((0, self.spec.proprio_size), np.float32)
+            actions = np.zeros((0, learner.ACTION_DIM), np.float32)
+            return learner.Batch({VIEW: images}, empty, actions)
+        whole = _Numbers(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
+        if not self.config.learner(self.method).turns:
+            return learner.Batch({VIEW: images}, whole.proprio, whole.actions)
+        frames = self.recording.camera.camera()
+        cameras = window_cameras(frames, whole.cam_to_world, whole.tcp, self.spec)
+        return learner.Batch(
+            {VIEW: images},
+            whole.proprio,
+            whole.actions,
+            cameras={VIEW: cameras},
+            tcp=whole.tcp[:, :3, 3],
+        )
 
     def _note_views(self, data: learner.Batch) -> None:
         """A few of the images that the policy is trained with, for the report."""
@@ -325,42 +345,47 @@ class _Job:
         records.save_arrays(self.folder / "views.npz", views)
 
 
-def _batch(
-    images: np.ndarray,
-    numbers: Mapping[str, Sequence[np.ndarray]],
-    cameras: Sequence[Camera],
-    spec: AlignSpec,
-) -> learner.Batch:
-    widths = {"proprio": spec.proprio_size, "actions": learner.ACTION_DIM, "tcp": 3}
-    # With nothing held out there is nothing to join.
-    whole = {
-        name: np.concatenate([np.zeros((0, widths[name]), np.float32), *parts])
-        for name, parts in numbers.items()
-    }
-    joined = (
-        {VIEW: jax.tree.map(lambda *leaves: np.concatenate(leaves), *cameras)} if cameras else {}
-    )
-    return learner.Batch(
-        {VIEW: images}, whole["proprio"], whole["actions"], cameras=joined, tcp=whole["tcp"]
-    )
+class _Numbers(NamedTuple):
+    """Of the frames that show the TCP, [T, ...] float32 each."""
+
+    proprio: np.ndarray
+    actions: np.ndarray
+    tcp: np.ndarray  # [T, 4, 4]
+    cam_to_world: np.ndarray  # [T, 4, 4]
+
+    @classmethod
+    def of(cls, episode: aligning.AlignedEpisode) -> "_Numbers":
+        shown = episode.valid
+        pose = np.asarray(episode.camera.cam_to_world, np.float32)
+        poses = np.broadcast_to(pose, (int(shown.sum()), 4, 4))
+        return cls(episode.proprio[shown], episode.actions[shown], episode.tcp[shown], poses)
 
 
-def _window_cameras(camera: Camera, tcp: np.ndarray, spec: AlignSpec) -> Camera:
-    """The cameras (leaves [T, ...]) of the images that `align` makes of the camera's at the TCP
-    poses [T, 4, 4]."""
-    if spec.crop is None:
-        view = spec.view_camera(camera)
-        return jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], len(tcp), 0), view)
+def window_cameras(
+    camera: Camera, cam_to_world: np.ndarray, tcp: np.ndarray, spec: AlignSpec
+) -> Camera:
+    """The cameras of the images that `palm_jax.align.align` makes.
+
+    Args:
+      camera: K and size of the frames.
+      cam_to_world: [N, 4, 4] its poses.
+      tcp: [N, 4, 4] TCP poses.
+      spec: what was done.
+
+    Returns:
+      Camera of size x size pixels with NumPy leaves [N, ...].
+    """
     crop, scale = spec.crop, spec.scale
-    # The window is cut in the camera's own pixels, and resized after that.
-    own = dataclasses.replace(spec, size=crop)
 
-    def one(pose: jax.Array) -> Camera:
-        origin, _ = window_origin(camera, pose, own)
-        window = camera.cropped(origin[::-1].astype(jnp.float32), crop, crop)
-        return window.scaled(scale)
+    def one(pose: jax.Array, hand: jax.Array) -> Camera:
+        posed = dataclasses.replace(camera, cam_to_world=pose)
+        if crop is None:
+            return spec.view_camera(posed)
+        # The window is cut in the camera's own pixels, and resized after that.
+        origin, _ = window_origin(posed, hand, dataclasses.replace(spec, size=crop))
+        return posed.cropped(origin[::-1].astype(jnp.float32), crop, crop).scaled(scale)
 
-    return jax.tree.map(np.asarray, jax.vmap(one)(jnp.asarray(tcp)))
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(cam_to_world, tcp))
 
 
 @contextmanager

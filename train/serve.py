@@ -47,6 +47,7 @@ class ServeConfig:
       image_size: rows and columns of the images to come; others work, the first one slowly.
       zoom: see palm_jax.policy.load.
       off_centre: see palm_jax.policy.load.
+      dist: lens coefficients of the camera, 4, 5 or 8; its images are then sent as they are.
       max_megabytes: the largest message that is read.
     """
 
@@ -56,6 +57,7 @@ class ServeConfig:
     image_size: tuple[int, int] = IMAGE_SIZE
     zoom: float = 1.0
     off_centre: float = 0.15
+    dist: tuple[float, ...] = ()
     max_megabytes: float = 32.0
 
 
@@ -243,7 +245,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _main(config: ServeConfig, console: Console) -> int:
     console.print(f"Loading {config.run} ...", markup=False)
     policy = load(
-        config.run, image_size=config.image_size, zoom=config.zoom, off_centre=config.off_centre
+        config.run,
+        image_size=None,
+        zoom=config.zoom,
+        off_centre=config.off_centre,
+        dist=config.dist or None,
     )
     took = policy.warm_up(*config.image_size)
     server = Server(policy.decide, metadata_of(policy), max_bytes=round(1e6 * config.max_megabytes))

@@ -99,6 +99,9 @@ GOOD = plain(np.float32([1, 2]))
         ({b"__npgeneric__": True, b"dtype": "<f4"}, "needs a number"),
         ({b"__npgeneric__": True, b"data": "1", b"dtype": "<f4"}, "needs a number"),
         ({b"__npgeneric__": True, b"data": 1, b"dtype": "|O"}, "do not travel"),
+        ({b"__npgeneric__": True, b"data": 300, b"dtype": "|u1"}, "uint8 cannot be 300"),
+        ({b"__npgeneric__": True, b"data": float("inf"), b"dtype": "<i8"}, "cannot be inf"),
+        ({b"__npgeneric__": True, b"data": float("nan"), b"dtype": "<i8"}, "cannot be nan"),
     ],
 )
 def test_arrays_that_are_none(entry: dict[bytes, Any], words: str) -> None:

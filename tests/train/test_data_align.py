@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,10 +15,11 @@ import oracles
 import pytest
 from scipy.spatial.transform import Rotation
 
+from palm_jax.__main__ import main
 from palm_jax.align import AlignSpec
 from palm_jax.train import data
 from palm_jax.train.data import aligning, job, output, robomimic_writer, soundness
-from palm_jax.train.data.errors import DataError, OutputError, TruncatedError
+from palm_jax.train.data.errors import CalibrationError, DataError, OutputError, TruncatedError
 from palm_jax.train.data.job import Options
 from palm_jax.train.data.recording import Recording, open_recording
 
@@ -111,7 +113,8 @@ def test_against_slow_references(aligned: Path, episode: str) -> None:
     ends = [*tcp[1:], tcp[-1]]
     deltas = [oracles.delta(now, then) for now, then in zip(tcp, ends, strict=True)]
     np.testing.assert_allclose(got["palm_actions"][:, :9], deltas, atol=2e-5)
-    labels = oracles.gripper_labels(got["obs/palm_opening"])
+    # At 20 / 3 frames a second the gripper moves three times as far in a frame.
+    labels = oracles.gripper_labels(got["obs/palm_opening"], 0.06)
     np.testing.assert_array_equal(got["palm_actions"][:, 9], labels)
 
 
@@ -139,6 +142,28 @@ def test_labels_do_not_depend_on_the_padding(lift: Recording) -> None:
     over = aligning.labels(trajectory, transitions=1)
     np.testing.assert_array_equal(over[longest, :9], [1, 0, 0, 0, 1, 0, 0, 0, 0])
     assert (over[np.arange(len(over)) != longest] == every[np.arange(len(over)) != longest]).all()
+
+
+@pytest.mark.parametrize("rate", [10, 20, 60])
+def test_a_gripper_closes_in_a_second_at_any_rate(rate: int, tmp_path: Path) -> None:
+    """A file that says its rate, through `stream`: open, closing for a second, closed."""
+    assert aligning.PAPER_STEP * aligning.PAPER_RATE == pytest.approx(0.4)  # a second's
+    steps = np.clip(np.arange(3 * rate) - rate, 0, rate) / rate
+
+    def write(file: h5py.File) -> None:
+        file["data"].attrs["env_args"] = json.dumps({"env_kwargs": {"control_freq": rate}})
+        demo = file["data/demo_0"]
+        rows = np.resize(np.arange(15), 3 * rate)
+        for key in (datasets.IMAGES, "actions", "obs/robot0_eef_pos", "obs/robot0_eef_quat"):
+            datasets.replace(demo, key, demo[key][()][rows])
+        fingers = 0.04 * np.stack([1 - steps, steps - 1], 1)
+        datasets.replace(demo, "obs/robot0_gripper_qpos", fingers)
+
+    path = datasets.changed(datasets.LIFT, tmp_path, write)
+    with open_recording(path, datasets.robosuite(path)) as recording:
+        (found,) = aligning.stream(recording, SPEC, episodes=["demo_0"])
+    np.testing.assert_array_equal(found.actions[:rate, 9], 1)
+    np.testing.assert_array_equal(found.actions[rate:, 9], 0)
 
 
 @pytest.mark.parametrize("flip", ["ud", "lr", "180", "cw", "ccw"])
@@ -515,7 +540,7 @@ def test_verify_finds_what_does_not_add_up(tmp_path: Path) -> None:
     path = datasets.changed(datasets.LIFT, tmp_path, spoil)
     problems = data.verify(path)
     assert problems[""] == ["total is 99, not 33"]
-    assert "NaN or infinity in 1 frames from 3 on" in problems["demo_0"][0]
+    assert "NaN or infinity in 1 frames, the first at 3" in problems["demo_0"][0]
     assert f"{datasets.IMAGES} has 16 images, expected 18" in problems["demo_1"]
     assert "obs/robot0_joint_pos has 17 rows, expected 18" in problems["demo_1"]
 
@@ -531,13 +556,86 @@ def test_repair_leaves_the_unsound_out(tmp_path: Path) -> None:
     result = data.repair(path, tmp_path / "new.hdf5")
     assert result.kept == ("demo_1",) and "NaN" in result.dropped["demo_0"]
     assert data.verify(tmp_path / "new.hdf5") == {} and datasets.digest(path) == before
-    original, saved = arrays(datasets.LIFT, "demo_1"), arrays(tmp_path / "new.hdf5")
+    original, saved = (arrays(p, "demo_1") for p in (datasets.LIFT, tmp_path / "new.hdf5"))
     for key, value in original.items():
         np.testing.assert_array_equal(saved[key], value)
     with h5py.File(tmp_path / "new.hdf5") as file:
-        assert list(file["mask/valid"][()]) == [b"demo_0"]
+        assert list(file["mask/valid"][()]) == [b"demo_1"] and list(file["data"]) == ["demo_1"]
         assert file["data"].attrs["total"] == 18
         assert json.loads(file["data"].attrs["palm_repair"])["dropped"]["demo_0"]
+
+
+def scaled(poses: np.ndarray) -> np.ndarray:
+    poses[3] *= [[2.0], [2.0], [2.0], [1.0]]
+    return poses
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "words"),
+    [
+        ("obs/robot0_eef_quat", lambda q: q * (np.arange(15) != 4)[:, None], "length 1"),
+        ("obs/palm_tcp", scaled, "frame 3: expected an orthonormal"),
+        ("obs/robot0_gripper_qpos", lambda q: q / (np.arange(15) != 4)[:, None], "has NaN"),
+        ("obs/robot0_gripper_qpos", lambda q: q[:-1], "expected 15 rows in .*, got 14"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:divide by zero")
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_repair_leaves_out_what_align_refuses(
+    key: str, change: Callable[[np.ndarray], np.ndarray], words: str, aligned: Path, tmp_path: Path
+) -> None:
+    def spoil(file: h5py.File) -> None:
+        demo = file["data/demo_0"]
+        datasets.replace(demo, key, change(demo[key][()]))
+
+    told = datasets.robosuite()
+    if key == "obs/palm_tcp":
+        told = dataclasses.replace(told, robot=data.RobotKeys("palm_tcp", None, "palm_opening"))
+        camera = dataclasses.replace(told.cameras["agentview"], image=datasets.IMAGES)
+        told = dataclasses.replace(told, cameras={"agentview": camera})
+    path = datasets.changed(aligned, tmp_path, spoil)
+    with h5py.File(path, "r+") as file, h5py.File(datasets.LIFT) as old:
+        for name in ("demo_0", "demo_1"):
+            old.copy(old[f"data/{name}/{datasets.IMAGES}"], file[f"data/{name}/obs"])
+    with (
+        open_recording(path, told) as recording,
+        pytest.raises(DataError, match=f"demo_0: .*{words}.* data repair .* --calibration C"),
+    ):
+        recording.survey()
+    problems = data.verify(path, robot=told.robot)
+    assert list(problems) == ["demo_0"] and re.search(words, problems["demo_0"][0])
+    assert data.repair(path, tmp_path / "new.hdf5", robot=told.robot).kept == ("demo_1",)
+    with open_recording(tmp_path / "new.hdf5", told) as recording:
+        assert recording.survey().episodes == 1
+
+
+def test_a_damaged_first_episode_hides_no_other(tmp_path: Path) -> None:
+    """Its gripper cannot be read, by which the keys are recognised."""
+
+    def spoil(file: h5py.File) -> None:
+        values = file["data/demo_0/obs/robot0_gripper_qpos"][()]
+        datasets.replace(file["data/demo_0"], "obs/robot0_gripper_qpos", values, compression="gzip")
+        file["data/demo_0/obs/robot0_gripper_qpos"].id.write_direct_chunk((0, 0), b"\0" * 50)
+        file["data/demo_1/obs/robot0_eef_pos"][3] = np.nan
+        file.copy("data/demo_1", "data/demo_2")
+        file["data/demo_2/obs/robot0_eef_pos"][3] = file["data/demo_2/obs/robot0_eef_pos"][2]
+
+    path = datasets.changed(datasets.LIFT, tmp_path, spoil)
+    assert "cannot be read" in data.verify(path)["demo_0"][0]
+    assert data.repair(path, tmp_path / "new.hdf5").kept == ("demo_2",)
+
+
+def test_poses_that_nobody_looked_at_are_mentioned(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = datasets.lerobot(tmp_path)
+    path = data.save_calibration(datasets.lerobot_calibration(), tmp_path / "c.json")
+    for command in (["verify"], ["repair", "--out", str(tmp_path / "new")]):
+        words = ["data", command[0], str(root), *command[1:]]
+        assert main(words) == 0
+        assert "poses were not looked at; pass --calibration" in capsys.readouterr().out
+    assert main(["data", "verify", str(root), "--calibration", str(path)]) == 0
+    assert "not looked at" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("share", [0.55, 0.7, 0.9])
@@ -563,8 +661,8 @@ def test_repair_of_a_cut_file_takes_nothing_for_zeros(
         assert not (tmp_path / "saved.hdf5").exists()
         return
     assert data.verify(tmp_path / "saved.hdf5") == {}
-    for number, name in enumerate(result.kept):
-        saved = arrays(tmp_path / "saved.hdf5", f"demo_{number}")
+    for name in result.kept:
+        saved = arrays(tmp_path / "saved.hdf5", name)
         for key, value in arrays(datasets.LIFT, name).items():
             np.testing.assert_array_equal(saved[key], value, err_msg=key)
 
@@ -587,6 +685,13 @@ def test_repair_of_lerobot(tmp_path: Path) -> None:
     assert "15 images, expected 18" in data.verify(root, robot=robot)["1"][0]
     result = data.repair(root, tmp_path / "saved", robot=robot)
     assert result.kept == ("0",) and list(result.dropped) == ["1"]
+    told = datasets.lerobot_calibration()
+    front = told.cameras["front"]
+    front = dataclasses.replace(front, by_episode={"1": front.cam_to_base})
+    with open_recording(
+        tmp_path / "saved", dataclasses.replace(told, cameras={"front": front})
+    ) as recording:
+        assert recording.source.episodes == ("0",)  # the other is known to be gone
     assert data.verify(tmp_path / "saved", robot=robot) == {}
     before = table_of(root, "data/chunk-000/file-000.parquet")
     after = table_of(tmp_path / "saved", "data/chunk-000/file-000.parquet")
@@ -595,6 +700,85 @@ def test_repair_of_lerobot(tmp_path: Path) -> None:
         key = "observation.images.front"
         for got, expected in zip(saved.blocks("0", key, 8), old.blocks("0", key, 8), strict=True):
             np.testing.assert_array_equal(got, expected)
+
+
+# -- calibrations after a repair -------------------------------------------------------------------
+
+
+def raised(name: str) -> data.Calibration:
+    """The Lift calibration whose camera stood higher in one episode."""
+    found = datasets.robosuite()
+    camera = found.cameras["agentview"]
+    pose = camera.cam_to_base + oracles.pose(np.zeros((3, 3)), [0, 0, 0.3]) - np.diag([0, 0, 0, 1])
+    camera = dataclasses.replace(camera, by_episode={name: pose})
+    return dataclasses.replace(found, cameras={"agentview": camera})
+
+
+@pytest.mark.parametrize("spoiled", ["demo_0", "demo_1"])
+def test_the_calibration_of_before_is_that_of_the_repaired_file(
+    spoiled: str, tmp_path: Path
+) -> None:
+    """align, its error, repair, align: as docs/your_data.md says. Repaired twice."""
+
+    def spoil(file: h5py.File) -> None:
+        file[f"data/{spoiled}/obs/robot0_eef_pos"][3] = np.nan
+
+    path = datasets.changed(datasets.LIFT, tmp_path, spoil)
+    first, second = tmp_path / "first.hdf5", tmp_path / "second.hdf5"
+    data.repair(path, first)
+    data.repair(first, second)
+    (kept,) = {"demo_0", "demo_1"} - {spoiled}
+    for repaired in (first, second):
+        with open_recording(repaired, raised("demo_1")) as recording:
+            (episode,) = data.aligned_episodes(recording, SPEC)
+        assert episode.name == kept
+        height = camera()[1][2, 3] + (0.3 if kept == "demo_1" else 0)
+        assert episode.camera.cam_to_world[2, 3] == pytest.approx(height, abs=1e-6)
+
+
+def test_poses_of_episodes_that_there_are_not(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"by_episode: expected .* got traj_1.*demo_0, demo"):
+        open_recording(datasets.LIFT, raised("traj_1"))
+
+
+def test_lerobot_numbers_anew_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    root = datasets.lerobot(tmp_path)
+    table = root / "data/chunk-000/file-000.parquet"
+    columns = pq.read_table(table).to_pydict()
+    columns["observation.state"][2][0] = float("nan")  # of episode 0
+    pq.write_table(pa.table(columns), table)
+    told = datasets.lerobot_calibration()
+    front, pose = told.cameras["front"], raised("1").cameras["agentview"].by_episode["1"]
+    told = data.Calibration(
+        {"front": dataclasses.replace(front, by_episode={"0": pose, "1": pose})},
+        told.ee_to_tcp,
+        told.robot,
+    )
+    path = data.save_calibration(told, tmp_path / "c.json")
+    words = ["data", "repair", root, "--calibration", path, "--out", tmp_path / "new"]
+    assert main([str(word) for word in words]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "numbered anew: 1 is now 0 (all in" in out
+    assert "cameras.front.by_episode: 0 was left out" in out
+    assert "cameras.front.by_episode: 1 is now 0" in out
+    note = json.loads((tmp_path / "new/meta/palm.json").read_text())
+    assert note["episodes"] == {"1": "0"} and list(note["dropped"]) == ["0"]
+    with pytest.raises(CalibrationError, match="got 1, .*anew .1 is now 0.: give it the --cal"):
+        open_recording(tmp_path / "new", told)
+    with open_recording(tmp_path / "new", tmp_path / "new/meta/calibration.json") as recording:
+        assert list(recording.camera.by_episode) == ["0"]
+        np.testing.assert_allclose(recording.camera.camera("0").cam_to_world, pose, atol=1e-6)
+        (episode,) = data.aligned_episodes(recording, SPEC)
+    assert len(episode.images) == 18
+    assert main(["data", "repair", str(root), "--out", str(tmp_path / "again")]) == 0
+    assert (
+        "numbered anew" not in capsys.readouterr().out
+    )  # without it no pose is known, none is bad
 
 
 def test_nothing_to_repair(tmp_path: Path) -> None:

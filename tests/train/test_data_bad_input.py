@@ -18,8 +18,9 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from palm_jax.__main__ import main
-from palm_jax.train.data import calibration, output
+from palm_jax.train.data import calibration, output, verify
 from palm_jax.train.data.errors import DiskFullError
+from palm_jax.train.metrics import plain
 
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
 Change = Callable[[h5py.File], None]
@@ -47,6 +48,10 @@ class Case(NamedTuple):
 
 def pose() -> np.ndarray:
     return datasets.robosuite(datasets.CAN).cameras["agentview"].cam_to_base
+
+
+def intrinsics(cx: float, cy: float) -> np.ndarray:
+    return np.array([[154.5, 0, cx], [0, 154.5, cy], [0, 0, 1]])
 
 
 def images(turn: Callable[[np.ndarray], np.ndarray]) -> Change:
@@ -111,6 +116,45 @@ def lerobot(**options: Any) -> Callable[[Path], Path]:
     return lambda folder: datasets.lerobot(folder, **options)
 
 
+def attribute(name: str, value: Any, place: str = "data") -> Change:
+    return lambda file: file[place].attrs.__setitem__(name, value)
+
+
+def described(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], Path]:
+    """A LeRobot set with another meta/info.json: changed in place, or what `change` returns."""
+
+    def make(folder: Path) -> Path:
+        root = datasets.lerobot(folder)
+        path = root / "meta" / "info.json"
+        content = json.loads(path.read_text())
+        other = change(content)
+        path.write_text(json.dumps(content if other is None else other))
+        return root
+
+    return make
+
+
+def feature(key: str, **entries: Any) -> Callable[[Path], Path]:
+    return described(lambda info: info["features"][key].update(entries))
+
+
+def listed(change: Callable[[dict[str, list[Any]]], Any]) -> Callable[[Path], Path]:
+    """A LeRobot set with another table meta/episodes."""
+
+    def make(folder: Path) -> Path:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        root = datasets.lerobot(folder)
+        path = root / "meta/episodes/chunk-000/file-000.parquet"
+        columns = pq.read_table(path).to_pydict()
+        change(columns)
+        pq.write_table(pa.table(columns), path)
+        return root
+
+    return make
+
+
 FRONT = {"name": "front", "pose": "observation.state[0:6]", "rotation": "euler_xyz"}
 FRONT |= {"opening": "observation.state[6]", "closed": 0.0, "open": 0.04}
 SIX = {"pose": "robot0_eef_pos+cube", "rotation": None}
@@ -133,6 +177,99 @@ CASES: dict[str, Case] = {
     "images damaged": Case(
         "TruncatedError", ["cannot be read", "data repair"],
         change=lambda file: damage(file["data/demo_0"][datasets.IMAGES]),
+    ),
+    # What files say of themselves.
+    "env_args that are cut": Case(
+        "FormatError", ["env_args: expected JSON, got {cut"], change=attribute("env_args", "{cut")
+    ),
+    "env_args that are a list": Case(
+        "FormatError", ["env_args: expected an object {...}, got [1]"],
+        change=attribute("env_args", "[1]"),
+    ),
+    "env_kwargs that are a text": Case(
+        "FormatError", ["env_kwargs: expected an object"],
+        change=attribute("env_args", '{"env_kwargs": "x"}'),
+    ),
+    "a rate that is a text": Case(
+        "FormatError", ["control_freq: expected frames a second, got fast"],
+        change=attribute("env_args", '{"env_kwargs": {"control_freq": "fast"}}'),
+    ),
+    "a rate of nothing": Case(
+        "FormatError", ["fps: expected frames a second, got 0"],
+        change=lambda file: [attribute("env_args", "{}")(file), attribute("fps", 0)(file)] and None,
+    ),
+    "a single action": Case(
+        "FormatError", ["demo_0: actions: expected an array with a row for each frame", "repair"],
+        change=lambda file: datasets.replace(file["data/demo_0"], "actions", np.float64(3)),
+    ),
+    "a number of frames that is a text": Case(
+        "FormatError", ["demo_0: num_samples: expected a whole number of at least 0, got many"],
+        change=lambda file: [
+            attribute("num_samples", "many", "data/demo_0")(file), without("actions")(file)
+        ] and None,
+    ),
+    "info.json that is a list": Case(
+        "FormatError", ["info.json: expected an object"], file=described(lambda info: [1])
+    ),
+    "info.json without a rate": Case(
+        "FormatError", ["info.json: fps: expected frames a second, got nothing"],
+        file=described(lambda info: info.pop("fps") and None),
+    ),
+    "info.json with no rate": Case(
+        "FormatError", ["fps: expected frames a second, got 0"],
+        file=described(lambda info: info.update(fps=0)),
+    ),
+    "info.json with a rate in words": Case(
+        "FormatError", ["fps: expected frames a second, got fast"],
+        file=described(lambda info: info.update(fps="fast")),
+    ),
+    "info.json without features": Case(
+        "FormatError", ["features: expected an object {...}, got nothing"],
+        file=described(lambda info: info.pop("features") and None),
+    ),
+    "a feature without a shape": Case(
+        "FormatError", ["features: action: expected a dtype, and a shape"],
+        file=feature("action", shape=None),
+    ),
+    "a feature without a type": Case(
+        "FormatError", ["features: action: expected a dtype, and a shape"],
+        file=feature("action", dtype=None),
+    ),
+    "a shape in words": Case(
+        "FormatError", ["features: action: expected a dtype, and a shape"],
+        file=feature("action", shape=["seven"]),
+    ),
+    "a feature of another width": Case(
+        "FormatError", ["observation.state: expected 8 numbers a frame", "episode 0"],
+        file=feature("observation.state", shape=[8]), calibrated=FRONT,
+    ),
+    "info.json without the place of the tables": Case(
+        "FormatError", ["data_path: expected a path with {chunk_index}", "got nothing"],
+        file=described(lambda info: info.pop("data_path") and None),
+    ),
+    "a place with other names": Case(
+        "FormatError", ["data_path: expected a path", "got data/{episode}"],
+        file=described(lambda info: info.update(data_path="data/{episode}")),
+    ),
+    "info.json without the place of the videos": Case(
+        "FormatError", ["video_path: expected a path with {chunk_index}"],
+        file=described(lambda info: info.update(video_path=None)),
+    ),
+    "episodes without a length": Case(
+        "FormatError", ["meta/episodes: row 0: length: expected a number", "got nothing"],
+        file=listed(lambda columns: columns.pop("length")),
+    ),
+    "episodes without a table": Case(
+        "FormatError", ["meta/episodes: row 0: data/chunk_index: expected a number"],
+        file=listed(lambda columns: columns.pop("data/chunk_index")),
+    ),
+    "episodes that begin nowhere": Case(
+        "FormatError", ["row 0: videos/observation.images.front/from_timestamp: expected"],
+        file=listed(lambda columns: columns.pop("videos/observation.images.front/from_timestamp")),
+    ),
+    "an episode that comes twice": Case(
+        "FormatError", ["expected each episode_index once"],
+        file=listed(lambda columns: columns.update(episode_index=[0, 0])),
     ),
     # Calibration.
     "missing calibration": Case(
@@ -157,11 +294,16 @@ CASES: dict[str, Case] = {
     ),
     "K for another resolution": Case(
         "ImageSizeError", ["expected images of 512 x 512", "got 128 x 128", "--rescale 128 128"],
-        calibrated={"width": 512, "height": 512},
+        calibrated={"width": 512, "height": 512, "K": lambda: intrinsics(256, 256)},
     ),
     "K with another principal point": Case(
-        "ImageSizeError", ["principal point inside", "another resolution", "--rescale"],
-        calibrated={"K": lambda: np.array([[618.0, 0, 256], [0, 618, 256], [0, 0, 1]])},
+        "ImageSizeError", ["principal point near", "cx = 256.0 of 128;", "another resolution",
+                           "--rescale"],
+        calibrated={"K": lambda: intrinsics(256, 256)},
+    ),
+    "K for a smaller resolution": Case(
+        "ImageSizeError", ["cx = 32.0 of 128;", "another resolution", "--rescale", "--off-centre"],
+        calibrated={"K": lambda: intrinsics(32, 32)},
     ),
     "TCP behind the camera": Case(
         "TcpBehindCameraError", ["behind the camera in 100%", "inverted", "data check"],
@@ -174,6 +316,10 @@ CASES: dict[str, Case] = {
     "inverted extrinsics": Case(
         "TcpOutOfViewError", ["inverted", "--inverse"],
         calibrated={"T_base_cam": lambda: np.linalg.inv(pose())},
+    ),
+    "a camera of episodes that are not there": Case(
+        "CalibrationError", ["by_episode", "got traj_3", "rename them; the file has demo_0"],
+        calibrated={"by_episode": lambda: {"traj_3": pose()}},
     ),
     # Images.
     "images upside down": Case(
@@ -194,7 +340,17 @@ CASES: dict[str, Case] = {
     ),
     "images turned, not square": Case(
         "ImageSizeError", ["96 x 128", "got 128 x 96", "--flip cw or ccw"],
-        change=images(lambda i: i[:, :96]), calibrated={"width": 96},
+        change=images(lambda i: i[:, :96]),
+        calibrated={"width": 96, "K": lambda: intrinsics(48, 64)},
+    ),
+    # Measured pixels.
+    "a camera that was moved": Case(
+        "ReprojectionError", ["within 3.0 px", "agentview_tcp_uv", "stood elsewhere", "--trust"],
+        calibrated={"T_base_cam": lambda: pose() @ oracles.pose(np.eye(3), [0.03, 0, 0])},
+    ),
+    "pixels that are none": Case(
+        "FormatError", ["expected 31 x 2 measured pixels", "got 3 x 2", "--pixels", "--trust"],
+        change=rows("obs/agentview_tcp_uv", 3),
     ),
     # Poses.
     "angles without an order": Case(
@@ -234,6 +390,14 @@ CASES: dict[str, Case] = {
             file["data/demo_0"], "obs/robot0_gripper_qpos", np.ones((31, 6))
         ),
     ),
+    "a gripper in other units": Case(
+        "OpeningError", ["from 0.02083 to", "0.001 for open: far outside", "--open VALUE", "--tr"],
+        calibrated={"opening": "robot0_gripper_qpos", "closed": 0.0, "open": 0.001},
+    ),
+    "a gripper that is never open": Case(
+        "OpeningError", ["with 0 for closed and 0.4 for open", "never half open", "--open VALUE"],
+        calibrated={"opening": "robot0_gripper_qpos", "closed": 0.0, "open": 0.4},
+    ),
     "no gripper": Case(
         "OpeningError", ["which key is the gripper", "--opening"],
         change=without("obs/robot0_gripper_qpos"),
@@ -244,10 +408,12 @@ CASES: dict[str, Case] = {
     ),
     # Episodes.
     "an episode of length one": Case(
-        "EpisodeLengthError", ["demo_0 has 1 frame;", "data repair"], change=every(1)
+        "EpisodeLengthError", ["demo_0: expected at least two frames", "got 1;", "data repair"],
+        change=every(1),
     ),
     "an empty episode": Case(
-        "EpisodeLengthError", ["demo_0 has 0 frames;", "data repair"], change=every(0)
+        "EpisodeLengthError", ["demo_0: expected at least two frames", "got 0;", "data repair"],
+        change=every(0),
     ),
     "fewer poses than actions": Case(
         "EpisodeLengthError", ["expected 31 rows in robot0_eef_pos", "got 28", "data repair"],
@@ -264,10 +430,24 @@ CASES: dict[str, Case] = {
         change=images(lambda i: np.concatenate([i, i[:3]])),
     ),
     # Options.
+    "all of it in another format": Case(
+        "OutputError", ["--keep all", "within one format"],
+        options=("--keep", "all", "--format", "lerobot"),
+    ),
     "a crop larger than the frame": Case(
         "DataError", ["--crop", "128 x 128", "got 300"], options=("--crop", "300")
     ),
     "an image of no pixels": Case("OptionError", ["AlignSpec.size"], options=("--size", "0")),
+    **{
+        f"a spec with {text}": Case(
+            "DataError", ["--spec: ", "expected a value like"], options=("--spec", text)
+        )
+        for text in (
+            '{"axis_length": "x"}', '{"axis_length": null}', '{"offset": 3}',
+            '{"offset": ["a", 1]}', '{"overlay": "no"}', '{"crop": true}', '{"crop": 40.5}',
+            '{"thickness": NaN}',
+        )
+    },
     "more transitions than frames": Case(
         "EpisodeLengthError", ["transitions, got 99"], options=("--transitions", "99")
     ),
@@ -285,7 +465,7 @@ def calibrated(folder: Path, entries: dict[str, Any]) -> Path:
     camera = content["cameras"].pop("agentview")
     content["cameras"][entries.get("name", "agentview")] = camera
     for key, value in entries.items():
-        value = np.asarray(value()).tolist() if callable(value) else value
+        value = plain(value()) if callable(value) else value
         if key in content["robot"]:
             content["robot"][key] = value
         elif key != "name":
@@ -315,6 +495,41 @@ def test_bad_input(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
         assert part in message, message
     assert list(made.iterdir()) == [], "something half-written is left"
     assert datasets.digest(given) == before, "the input was touched"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "camera_info: expected JSON"),
+        ("[]", "camera_info: expected an object"),
+        ('{"agentview": 3}', "agentview: expected an object"),
+        ('{"agentview": {"intrinsics": [[1]]}}', "intrinsics: expected 3 x 3 finite numbers, got"),
+    ],
+)
+@pytest.mark.parametrize("command", ["inspect", "calibrate"])
+def test_camera_info_that_is_none(
+    command: str, text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is read where `data align` has the calibration already."""
+    change = attribute("camera_info", text, "data/demo_0")
+    path = str(datasets.changed(datasets.CAN, tmp_path, change))
+    more = ["--from", "robosuite", "--out", str(tmp_path / "new.json"), "--file"]
+    assert main(["data", command, *(more if command == "calibrate" else []), path]) == 2
+    message = capsys.readouterr().err
+    assert "error: FormatError: " in message and words in message
+
+
+def test_damaged_headers_are_reported_by_verify(tmp_path: Path) -> None:
+    """One episode's, among the others' problems; a total in words."""
+
+    def spoil(file: h5py.File) -> None:
+        datasets.replace(file["data/demo_1"], "actions", np.float64(3))
+        file["data"].attrs["total"] = "many"
+
+    problems = verify(datasets.changed(datasets.LIFT, tmp_path, spoil))
+    assert list(problems) == ["demo_1"] and "a row for each frame" in problems["demo_1"][0]
+    total = datasets.changed(datasets.CAN, tmp_path, attribute("total", "many"))
+    assert verify(total) == {"": ["total is many, not 31"]}
 
 
 # -- the disk --------------------------------------------------------------------------------------
@@ -422,5 +637,5 @@ def test_every_error_is_in_the_table() -> None:
         if isinstance(value, type) and issubclass(value, errors.DataError)
     }
     tested = {case.error for case in CASES.values()} | {"DiskFullError"}
-    # Without pyarrow: test_data_sources; an output that exists: test_data_align.
-    assert named - tested == {"ExtraMissingError", "OutputError"}
+    # Without pyarrow: test_data_sources.
+    assert named - tested == {"ExtraMissingError"}

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import math
+from collections.abc import Callable
 from pathlib import Path
 
 import datasets
@@ -25,7 +27,7 @@ from palm_jax.train.data.errors import (
     ImageSizeError,
     PoseDataError,
 )
-from palm_jax.train.data.recording import open_recording
+from palm_jax.train.data.recording import open_recording, range_problem
 from palm_jax.train.data.source import open_source
 
 POSE = oracles.looking_at(np.array([1.0, -0.4, 1.5]), np.array([0.2, 0.1, 0.8]))
@@ -144,6 +146,18 @@ MIRROR = (POSE @ np.diag([1.0, -1.0, 1.0, 1.0])).tolist()
         ({"cameras__front__K": "no"}, CalibrationError, "expected numbers"),
         ({"cameras__front__width": 0}, CalibrationError, "number of pixels"),
         ({"cameras__front__width": 320}, ImageSizeError, "another resolution"),
+        (
+            {"cameras__front__width": 1280},
+            ImageSizeError,
+            "cx = 330.0 of 1280; .*another resolu",
+        ),
+        (
+            {"cameras__front__height": 900},
+            ImageSizeError,
+            "cy = 235.0 of 900; .*--off-centre",
+        ),
+        ({"cameras__front__off_centre": -1}, CalibrationError, "off_centre: expected a share"),
+        ({"cameras__front__off_centre": "no"}, CalibrationError, "off_centre: expected a share"),
         ({"cameras__front__flip": "left"}, CalibrationError, "none, ud, lr"),
         ({"cameras__front__dist": [0.1]}, CalibrationError, "4, 5, 8"),
         ({"cameras__front__dist": [None] * 5}, CalibrationError, "finite|numbers"),
@@ -154,6 +168,17 @@ MIRROR = (POSE @ np.diag([1.0, -1.0, 1.0, 1.0])).tolist()
         ({"cameras__front__by_episode": {"a": MIRROR}}, CalibrationError, "by_episode.a"),
         ({"T_ee_tcp": MIRROR}, CalibrationError, "T_ee_tcp"),
         ({"robot": {"hand": 1}}, CalibrationError, "unknown entries hand"),
+        ({"robot": [1]}, CalibrationError, "robot: expected an object, got list"),
+        ({"robot": {"pose": 3}}, CalibrationError, "robot.pose: expected a text, got 3"),
+        ({"robot": {"rotation": "yaw"}}, CalibrationError, "robot.rotation: .*euler_xyz.* 'yaw'"),
+        ({"robot": {"closed": "a"}}, CalibrationError, "robot.closed: expected a finite number"),
+        ({"robot": {"open": math.nan}}, CalibrationError, "robot.open: expected a finite number"),
+        ({"cameras": [1]}, CalibrationError, "cameras: expected an object, got list"),
+        ({"cameras__front__flip": []}, CalibrationError, "none, ud, lr"),
+        ({"cameras__front__image": 5}, CalibrationError, "front.image: expected a key, got 5"),
+        ({"cameras__front__by_episode": [1]}, CalibrationError, "by_episode: expected an object"),
+        ({"cameras__front__mount": None}, CalibrationError, "mount: expected 'static', got None"),
+        ({"T_ee_tcp": None}, CalibrationError, "T_ee_tcp: expected finite"),
     ],
 )
 def test_what_is_refused(changes: dict, error: type, words: str, tmp_path: Path) -> None:
@@ -162,6 +187,26 @@ def test_what_is_refused(changes: dict, error: type, words: str, tmp_path: Path)
     with pytest.raises(error, match=words) as caught:
         calib.load(path)
     assert str(path) in str(caught.value) and isinstance(caught.value, CalibrationError)
+
+
+def test_every_entry_may_be_odd(tmp_path: Path) -> None:
+    """Whatever stands in a calibration.json: it is read, and can be used, or refused by name."""
+    whole = content(cameras__front__by_episode={"demo_0": POSE.tolist()}, robot__pose="tcp")
+    tried = refused = 0
+    for place, entry in datasets.spoiled(whole):
+        tried += 1
+        path = tmp_path / "calibration.json"
+        path.write_text(json.dumps(entry))
+        try:
+            found = calib.load(path)
+            for each in found.cameras.values():
+                each.camera("demo_0"), calib.image_key(each, ["front", "x"])
+            assert len(found.sha256) == 64
+        except CalibrationError:
+            refused += 1
+        except Exception as error:
+            raise AssertionError(place) from error
+    assert tried > 500 and refused > tried / 2
 
 
 def test_no_file_and_no_json(tmp_path: Path) -> None:
@@ -219,6 +264,15 @@ def test_which_images_belong_to_a_camera() -> None:
     assert named.find(None, keys)[1] == "obs/other_image"
 
 
+def test_cameras_are_named_after_their_images(tmp_path: Path) -> None:
+    with open_source(datasets.LIFT) as source:
+        assert importers.with_images(source, []) == ["agentview"]
+    with open_source(datasets.lerobot(tmp_path)) as source:
+        assert importers.with_images(source, []) == ["front"]
+        assert importers.image_size(source, "front") == (128, 128)
+    assert calib.short_names("obs/_image") == {"obs/_image", "_image"}
+
+
 # -- importers -------------------------------------------------------------------------------------
 
 
@@ -262,6 +316,55 @@ def test_a_camera_that_stands_elsewhere_in_one_episode(tmp_path: Path) -> None:
     assert list(camera.by_episode) == ["demo_1"]
     shift = camera.camera("demo_1").cam_to_world - camera.camera("demo_0").cam_to_world
     np.testing.assert_allclose(shift[:, 3], [0.25, 0, 0, 0], atol=1e-6)
+
+
+def information(change) -> Callable[[h5py.File], None]:
+    """Changes `camera_info` of agentview in the second episode, or with its names in all."""
+
+    def apply(file: h5py.File) -> None:
+        for name, demo in file["data"].items():
+            info = json.loads(demo.attrs["camera_info"])
+            change(name, info["agentview"])
+            demo.attrs["camera_info"] = json.dumps(info)
+
+    return apply
+
+
+def test_intrinsics_of_smaller_images(tmp_path: Path) -> None:
+    """camera_info of 64 pixels beside images of 128."""
+
+    def halve(_: str, entry: dict) -> None:
+        entry["intrinsics"] = (np.array(entry["intrinsics"]) * [[0.5], [0.5], [1]]).tolist()
+
+    path = datasets.changed(datasets.LIFT, tmp_path, information(halve))
+    with pytest.raises(ImageSizeError, match="cx = 32.0 of 128; K belongs to another resolution"):
+        datasets.robosuite(path)
+    told = datasets.robosuite(path, size=(64, 64), rescale=(128, 128))
+    right = datasets.robosuite().cameras["agentview"]
+    np.testing.assert_allclose(told.cameras["agentview"].K, right.K, rtol=1e-9)
+    cropped = datasets.robosuite(path, off_centre=0.3)
+    again = calib.load(calib.save(cropped, tmp_path / "c.json"))
+    assert again.cameras["agentview"].off_centre == 0.3 and again.sha256 == cropped.sha256
+
+
+def test_intrinsics_that_differ_between_episodes(tmp_path: Path) -> None:
+    def zoom(name: str, entry: dict) -> None:
+        if name == "demo_1":
+            entry["intrinsics"][0][0] *= 2
+
+    path = datasets.changed(datasets.LIFT, tmp_path, information(zoom))
+    with pytest.raises(CalibrationError, match="same K in every episode.* in demo_0 .* in demo_1"):
+        datasets.robosuite(path)
+    models = {"a": MODEL, "b": MODEL.replace('fovy="45"', 'fovy="46"')}
+    sizes = {"low": (640, 480), "high": (640, 480)}
+    with pytest.raises(CalibrationError, match="low: expected the same K"):
+        importers.from_models(models, [], sizes)
+    with h5py.File(tmp_path / "sensors.hdf5", "w") as file:
+        for number in range(2):
+            for key, value in sensor(intrinsic_cv=K + number * np.eye(3) * [1, 1, 0]).items():
+                file[f"traj_{number}/sensor_param/front/{key}"] = value[None]
+    with pytest.raises(CalibrationError, match="same K .* in traj_0 .* in traj_1"):
+        importers.from_maniskill(tmp_path / "sensors.hdf5", None, [], (640, 480))
 
 
 MODEL = """<mujoco><compiler meshdir="/nowhere"/><asset><mesh name="m" file="absent.stl"/></asset>
@@ -437,6 +540,42 @@ def test_changing_a_calibration(tmp_path: Path) -> None:
     assert kept.to_json() == calib.load(path).to_json()
 
 
+def test_one_camera_is_changed_and_the_others_stay(tmp_path: Path) -> None:
+    """What `data check` advises for a camera must not break those that are right."""
+    both = Calibration({"front": camera(), "side": camera(name="side", flip="lr")})
+    path = calib.save(both, tmp_path / "both.json")
+    changes = {"flip": "ud", "axes": "opengl", "image": "obs/x", "rescale": (320, 240)}
+    made = commands.make_calibration(options("palm", file=path, camera=("front",), **changes))
+    assert made.to_json()["cameras"]["side"] == both.to_json()["cameras"]["side"]
+    front = made.cameras["front"]
+    assert (front.flip, front.image, front.width) == ("ud", "obs/x", 320)
+    np.testing.assert_allclose(front.cam_to_base, POSE @ GL)
+    assert list(made.cameras) == ["front", "side"]
+    every = commands.make_calibration(options("palm", file=path, flip="ud"))
+    assert {each.flip for each in every.cameras.values()} == {"ud"}
+    with pytest.raises(CameraNameError, match="'top' is not in the calibration.*front, side"):
+        commands.make_calibration(options("palm", file=path, camera=("top",), flip="ud"))
+    with pytest.raises(CalibrationError, match="--image .*front, side; choose it with --camera"):
+        commands.make_calibration(options("palm", file=path, image="obs/x"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "users"),
+    [
+        ("robosuite", {"inverse": True}, "droid, npy, palm"),
+        ("mujoco", {"axes": "opengl"}, "droid, npy, palm"),
+        ("maniskill", {"K": "1,1,1,1"}, "droid, npy"),
+        ("palm", {"size": (64, 64)}, "robosuite, mujoco, maniskill, droid, npy"),
+        ("palm", {"extrinsics": "1,1,1,1,1,1"}, "droid, npy"),
+        ("npy", {"euler": "xyz"}, "droid"),
+    ],
+)
+def test_options_without_an_effect_are_refused(kind: str, values: dict, users: str) -> None:
+    (name,) = values
+    with pytest.raises(CalibrationError, match=f"--{name}: .*{kind} does not .*only {users};"):
+        commands.make_calibration(options(kind, file=Path("absent"), **values))
+
+
 def test_the_other_orientation_that_robosuite_writes() -> None:
     """`robot0_eef_quat_site` is that of the grip site, a quarter turn from the hand's."""
     other = datasets.robosuite(
@@ -448,6 +587,48 @@ def test_the_other_orientation_that_robosuite_writes() -> None:
     ):
         expected, got = first.trajectory("demo_1").tcp, second.trajectory("demo_1").tcp
     np.testing.assert_allclose(got, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize(("closed", "opened"), [(1.0, -1.0), (-1.0, 1.0), (-0.04, 0.0)])
+def test_a_single_gripper_value_keeps_its_sign(
+    closed: float, opened: float, tmp_path: Path
+) -> None:
+    """robosuite's, LIBERO's and Bridge's command is -1 open, 1 closed; only of several fingers,
+    which mirror each other, is the sign nothing."""
+    share = np.linspace(0, 1, 15)
+
+    def add(file: h5py.File) -> None:
+        values = (closed + share * (opened - closed))[:, None]
+        file["data/demo_0/obs/grip"] = values
+        file["data/demo_0/obs/fingers"] = np.concatenate([share, -share]).reshape(2, 15).T
+
+    path = datasets.changed(datasets.LIFT, tmp_path, add)
+    for key, ends in (("grip", (closed, opened)), ("fingers", (0.0, 1.0))):
+        told = datasets.robosuite(path, opening=key, closed=ends[0], open=ends[1])
+        with open_recording(path, told) as recording:
+            got = recording.trajectory("demo_0").opening
+        np.testing.assert_allclose(got, share, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("reach", "words"),
+    [
+        ((0.0, 1.0), ""), ((-0.1, 1.1), ""),
+        ((0.6, 1.0), ""),  # closes around something wide
+        ((0.0, 0.03), ""), ((0.0, 0.0), ""),  # closed throughout
+        ((0.3, 0.32), ""),  # holds something throughout
+        ((0.0, 0.1), "never half open"), ((0.05, 0.4), "never half open"),
+        ((0.0, 25.0), "far outside"), ((-1.0, 0.0), "far outside"),
+    ],
+)  # fmt: skip
+def test_ranges_of_a_gripper(reach: tuple[float, float], words: str) -> None:
+    for closed, opened in ((0.0, 0.04), (1.0, 0.0), (1.0, -1.0)):
+        keys = calib.RobotKeys("p", "matrix", "grip", closed, opened)
+        problem = range_problem(keys, reach)
+        assert words in problem and bool(words) == bool(problem)
+        if problem:
+            ends = sorted(closed + share * (opened - closed) for share in reach)
+            assert f"grip goes from {ends[0]:.4g} to {ends[1]:.4g}" in problem
 
 
 def test_sources_name_their_keys_and_columns() -> None:

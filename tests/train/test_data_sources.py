@@ -13,6 +13,7 @@ import pytest
 
 from palm_jax.train.data import inspection, recording, source
 from palm_jax.train.data.errors import (
+    DataError,
     ExtraMissingError,
     FormatError,
     KeyMissingError,
@@ -232,6 +233,48 @@ def test_reading_lerobot_needs_nothing_but_the_extra() -> None:
     assert run.stdout.strip() == "set()", run.stderr
 
 
+def test_every_entry_of_info_json_may_be_odd(tmp_path: Path) -> None:
+    """It is read, looked into and verified, or refused by name."""
+    root = datasets.lerobot(tmp_path)
+    path = root / "meta/info.json"
+    whole = json.loads(path.read_text())
+    tried = refused = 0
+    for place, entry in datasets.spoiled(whole):
+        tried += 1
+        path.write_text(json.dumps(entry))
+        try:
+            with open_source(root) as data:
+                inspection.inspect(data)
+                data.columns("1", "observation.state")
+        except DataError:
+            refused += 1
+        except Exception as error:
+            raise AssertionError(place) from error
+    assert tried > 300 and refused > tried / 4
+
+
+@pytest.mark.parametrize("attribute", ["data.env_args", "data/demo_0.camera_info"])
+def test_every_entry_of_a_robomimic_header_may_be_odd(attribute: str, tmp_path: Path) -> None:
+    place, name = attribute.split(".")
+    path = datasets.changed(datasets.CAN, tmp_path, lambda file: None)
+    with h5py.File(path) as file:
+        whole = json.loads(file[place].attrs[name])
+    refused = 0
+    for where, entry in datasets.spoiled(whole):
+        with h5py.File(path, "r+") as file:
+            file[place].attrs[name] = json.dumps(entry)
+        try:
+            with open_source(path) as data:
+                inspection.inspect(data)
+                assert data.task("demo_0")
+                datasets.robosuite(path)
+        except DataError:
+            refused += 1
+        except Exception as error:
+            raise AssertionError(where) from error
+    assert refused > 5
+
+
 def test_fingerprints_tell_files_apart(
     tmp_path: Path, lerobot: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -263,6 +306,7 @@ def test_inspection(lerobot: Path, tmp_path: Path) -> None:
 
     def spoil(file: h5py.File) -> None:
         demo = file["data/demo_0"]
+        demo["obs/robot0_gripper_qpos"][...] /= 5  # a smaller one than the Panda's
         demo["obs/robot0_eef_pos"][3] = np.nan
         for key in ("actions", datasets.IMAGES):
             datasets.replace(file["data/demo_1"], key, file["data/demo_1"][key][:1])
@@ -271,3 +315,4 @@ def test_inspection(lerobot: Path, tmp_path: Path) -> None:
         notes = inspection.inspect(file).notes
     assert any("demo_1 has 1 frame:" in note for note in notes)
     assert any("obs/robot0_eef_pos has NaN" in note for note in notes)
+    assert any("0.04 for open: it moves, but is never half open" in note for note in notes)

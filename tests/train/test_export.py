@@ -123,3 +123,9 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert not list(tmp_path.iterdir())
     assert export.main(words) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"p", "p.jax", "p.json"}
+    (tmp_path / "p").unlink()
+    capsys.readouterr()
+    before = (tmp_path / "p.jax").read_bytes()
+    assert export.main(words) == 2
+    assert "p.jax exists: move it" in capsys.readouterr().err
+    assert (tmp_path / "p.jax").read_bytes() == before and not (tmp_path / "p").exists()

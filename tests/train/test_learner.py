@@ -161,6 +161,15 @@ def test_loss_refuses_to_broadcast() -> None:
             learner.mean_squared_error(prediction, jnp.ones(shape))
 
 
+@pytest.mark.parametrize("index", range(10))
+def test_no_number_that_is_not_finite_is_hidden(index: int) -> None:
+    """Orthonormal columns and a threshold would turn it into a good action."""
+    prediction = np.random.default_rng(0).normal(size=(2, 10)).astype(np.float32)
+    prediction[1, index] = np.nan
+    action = np.asarray(learner.to_action(jnp.asarray(prediction)))
+    assert np.isfinite(action[0]).all() and np.isnan(action[1]).all()
+
+
 def test_to_action_by_hand() -> None:
     prediction = jnp.array(
         [[0, 2.0, 0, 3.0, 4.0, 0, 0.1, 0.2, 0.3, 0.5], [1.0] * 3 + [0, 0, 2.0] * 2 + [0.51]]

@@ -23,6 +23,7 @@ from palm_jax.align import (
     PoseError,
     ProjectionError,
     ShapeError,
+    undistort,
 )
 from palm_jax.policy import (
     CalibrationError,
@@ -351,6 +352,28 @@ def test_cut_out_images_are_taken_when_told_so(policy: Policy) -> None:
     with pytest.raises(CameraError, match="larger off_centre"):
         policy.act(**{**GOOD, "K": shifted})
     lenient.act(**{**GOOD, "K": shifted})
+
+
+def test_a_lens_is_undone_before_all_else(policy: Policy) -> None:
+    """As if the image had been undistorted by hand; by what, tests/core/test_align_lens.py says."""
+    dist = (-0.3, 0.1, 0.001, -0.002)
+    lens = load(tiny.run(), image_size=SIZE, dist=dist)
+    by_hand = np.asarray(undistort(IMAGE, K, np.array(dist)))
+    shown, expected = lens.see(**GOOD), policy.see(**{**GOOD, "image": by_hand})
+    np.testing.assert_array_equal(shown.image, expected.image)
+    assert (shown.image != policy.see(**GOOD).image).any()
+    np.testing.assert_array_equal(lens.act(**GOOD)[0], policy.act(**{**GOOD, "image": by_hand})[0])
+
+
+@pytest.mark.parametrize("dist", [(0.1,), (0.1, 0.0, 0.0, np.nan)])
+def test_bad_lens_coefficients(dist: tuple[float, ...]) -> None:
+    with pytest.raises(PolicyError, match="dist: expected 4, 5, 8 finite"):
+        load(tiny.run(), image_size=None, dist=dist)
+
+
+def test_the_time_of_an_action_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    load(tiny.run(), image_size=SIZE)
+    assert "ms an action for images of 60 x 80" in capsys.readouterr().err
 
 
 def test_slightly_wrong_sensors_pass(policy: Policy) -> None:

@@ -154,6 +154,13 @@ def test_a_resumed_training_is_the_whole_one(run: Path, calibrated: Path, tmp_pa
     assert (out / "held_out.json").read_bytes() == (run / "palm" / "held_out.json").read_bytes()
 
 
+def test_turned_images_know_their_cameras(calibrated: Path, tmp_path: Path) -> None:
+    """The preset cpu turns the camera, which needs the camera of every image."""
+    out = tmp_path / "turned"
+    assert main(words(calibrated, out, "--method", "palm", "--turn", "30", "10")) == 0
+    assert np.isfinite(json.loads((out / "held_out.json").read_text())["loss"])
+
+
 def test_large_data_lie_in_a_file(
     run: Path, calibrated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -285,7 +292,8 @@ def test_the_cameras_of_the_images(crop: int | None) -> None:
     spec = AlignSpec(crop=crop, offset=(3, -2), size=size, overlay=False, frame=height)
     tcp = np.tile(np.eye(4, dtype=np.float32), (4, 1, 1))
     tcp[:, :3, 3] = [[0, 0, 1], [0.1, 0.05, 1], [-0.5, 0.2, 1], [0.5, -0.3, 1]]
-    found = recorded._window_cameras(camera, tcp, spec)
+    poses = np.tile(np.eye(4, dtype=np.float32), (4, 1, 1))
+    found = recorded.window_cameras(camera, poses, tcp, spec)
     whole = dataclasses.replace(spec, size=crop) if crop else None
     for index, pose in enumerate(tcp):
         scale = np.array([size / width, size / height]) if crop is None else size / crop
@@ -398,6 +406,19 @@ def test_one_episode_cannot_be_split(
     command[1] = str(path)
     assert main(command) == 2
     assert "--validation 0" in capsys.readouterr().err
+
+
+def test_episodes_that_never_show_the_tcp(
+    calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def change(file: h5py.File) -> None:
+        file["data/demo_0/obs/robot0_eef_pos"][:, 1] += 3.0
+        file["mask/train"], file["mask/valid"] = np.array([b"demo_1"]), np.array([b"demo_0"])
+
+    command = words(calibrated, tmp_path / "new", "--trust", "--least-in-view", "0.2")
+    command[1] = str(datasets.changed(datasets.LIFT, tmp_path, change))
+    assert main(command) == 2
+    assert "no frame of demo_0 shows the TCP" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize("what", ["data", "calibration"])

@@ -40,6 +40,10 @@ _AHEAD = 2
 _PADDED_TO = 64
 """Episodes are padded to a multiple of this many frames: labels then compile for few lengths."""
 
+PAPER_STEP, PAPER_RATE = 0.02, 20.0
+"""Change of the opening from frame to frame that the paper takes for a command, and at how many
+frames a second."""
+
 PAPER_ROWS = 512
 """Rows of the frames that the paper's pixel sizes refer to."""
 
@@ -94,11 +98,13 @@ def paper_spec(height: int, **changes: object) -> AlignSpec:
     return AlignSpec(**(scaled | changes))  # type: ignore[arg-type]
 
 
-def labels(trajectory: Trajectory, *, transitions: int = 0) -> np.ndarray:
+def labels(trajectory: Trajectory, *, transitions: int = 0, rate: float = PAPER_RATE) -> np.ndarray:
     """[T, 10] float32: the delta to the next recorded pose in the TCP's frame, and the gripper.
 
     Args:
       trajectory: T frames, two at least.
+      rate: frames a second: from one frame to the next a gripper moves the less, the more there
+        are, and the paper's threshold with it.
       transitions: the frames with so many largest translations become the identity
         (`palm_jax.align.overwrite_transitions`).
 
@@ -113,7 +119,7 @@ def labels(trajectory: Trajectory, *, transitions: int = 0) -> np.ndarray:
     tcp = np.concatenate([trajectory.tcp, np.repeat(trajectory.tcp[-1:], more, 0)])
     opening = np.concatenate([trajectory.opening, np.repeat(trajectory.opening[-1:], more)])
     deltas = overwrite_transitions(achieved_deltas(tcp), transitions)
-    commands = gripper_labels(opening)
+    commands = gripper_labels(opening, threshold=PAPER_STEP * PAPER_RATE / rate)
     return np.concatenate([deltas, commands[:, None]], 1)[:length]
 
 
@@ -235,7 +241,7 @@ def stream(
     blocks = ahead(_blocks(recording, names))
     for name, group in itertools.groupby(blocks, key=lambda block: block.episode):
         trajectory = recording.trajectory(name)
-        actions = labels(trajectory, transitions=transitions)
+        actions = labels(trajectory, transitions=transitions, rate=recording.source.fps)
         yield Stream(name, trajectory, actions, _aligned_blocks(recording, trajectory, group, spec))
 
 

@@ -5,7 +5,8 @@
     {"format": "palm-calib/1", "axes": "opencv",
      "cameras": {"front": {"K": 3x3, "width": 640, "height": 480, "dist": null,
                            "mount": "static", "flip": "none", "image": null,
-                           "T_base_cam": 4x4, "by_episode": {"demo_7": 4x4}}},
+                           "T_base_cam": 4x4, "by_episode": {"demo_7": 4x4},
+                           "off_centre": 0.15}},
      "T_ee_tcp": 4x4,
      "robot": {"pose": "robot0_eef_pos+robot0_eef_quat", "rotation": "quat_xyzw",
                "opening": "robot0_gripper_qpos", "closed": 0.0, "open": 0.04},
@@ -17,6 +18,8 @@
 - `K` is in pixels of a width x height image, (0, 0) the corner of the first pixel.
 - `flip` turns the stored images upright: none, ud, lr, 180, cw or ccw (a quarter turn).
 - `image` names the key of the camera's images where its own name does not tell.
+- `off_centre` is how far K's principal point may lie from the middle, as a share of the image:
+  further off, K is taken for that of another resolution. Cropped images need more.
 - `by_episode` holds the camera's pose in the episodes in which it was another one.
 - `T_ee_tcp` is the TCP in the frame of the recorded poses: origin between the finger pads, z the
   approach direction, y the opening axis (docs/conventions.md).
@@ -28,16 +31,26 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shlex
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from palm_jax._checks import CameraError, PoseError, check_intrinsics, check_pose
+from palm_jax._checks import (
+    OFF_CENTRE,
+    CameraError,
+    PoseError,
+    check_centre,
+    check_intrinsics,
+    check_pose,
+)
 from palm_jax.align import Camera
 from palm_jax.align.lens import LENGTHS
+from palm_jax.train.data import rotations
 from palm_jax.train.data.errors import CalibrationError, CameraNameError, ImageSizeError
+from palm_jax.train.data.headers import is_number
 from palm_jax.train.metrics import plain, write_json
 
 FORMAT = "palm-calib/1"
@@ -60,6 +73,17 @@ AXES = {
 """Camera axes of others -> what a pose with such axes is multiplied by, on the right."""
 
 
+def as_opencv(pose: np.ndarray, axes: str, inverse: bool) -> np.ndarray:
+    """A camera's poses in the base, OpenCV axes, out of what others store.
+
+    Args:
+      pose: [..., 4, 4].
+      axes: of its camera, a key of `AXES`.
+      inverse: it maps the base into the camera.
+    """
+    return (rotations.inverted(pose) if inverse else pose) @ AXES[axes]
+
+
 def turned(flip: str, width: int, height: int) -> tuple[int, int]:
     """Width and height of the images as stored, for an upright image of this size."""
     return (height, width) if flip in ("cw", "ccw") else (width, height)
@@ -78,6 +102,8 @@ class CameraCalibration:
       flip: what turns the stored images upright, a key of `FLIPS`.
       image: key of the images in the data; None: found by the camera's name.
       by_episode: poses [4, 4] of the episodes in which it differs.
+      off_centre: how far the principal point may lie from the middle, as a share of the image:
+        further off, K is taken for that of another resolution (`Calibration` checks it).
 
     Raises:
       CalibrationError: a value that no camera has; the message names it.
@@ -92,14 +118,18 @@ class CameraCalibration:
     flip: str = "none"
     image: str | None = None
     by_episode: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    off_centre: float = OFF_CENTRE
 
     def __post_init__(self) -> None:
         where = f"cameras.{self.name}"
         for name in ("width", "height"):
             value = getattr(self, name)
-            whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-            if not whole or not 1 <= value < 2**16:
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
                 raise CalibrationError(f"{where}.{name}: expected a number of pixels, got {value}")
+        if not is_number(self.off_centre) or self.off_centre < 0:
+            raise CalibrationError(
+                f"{where}.off_centre: expected a share of the image, got {self.off_centre!r}"
+            )
         if not isinstance(self.flip, str) or self.flip not in FLIPS:
             raise CalibrationError(
                 f"{where}.flip: expected one of {', '.join(FLIPS)}; got {self.flip!r}"
@@ -109,6 +139,10 @@ class CameraCalibration:
                 f"{where}.dist: expected null or {', '.join(map(str, LENGTHS))} coefficients (k1, "
                 f"k2, p1, p2[, k3[, k4, k5, k6]]), got {len(self.dist)}"
             )
+        if self.dist is not None and not all(map(is_number, self.dist)):
+            raise CalibrationError(f"{where}.dist: expected finite numbers, got {self.dist}")
+        if self.image is not None and not isinstance(self.image, str):
+            raise CalibrationError(f"{where}.image: expected a key, got {self.image!r}")
         self._check_intrinsics(f"{where}.K")
         _checked_pose(self.cam_to_base, f"{where}.T_base_cam")
         for episode, pose in self.by_episode.items():
@@ -121,13 +155,23 @@ class CameraCalibration:
             check_intrinsics(self.K, where)
         except CameraError as error:
             raise CalibrationError(str(error)) from error
-        u, v = float(self.K[0, 2]), float(self.K[1, 2])
-        if not (0 <= u <= self.width and 0 <= v <= self.height):
-            raise ImageSizeError(
-                f"{where}: expected the principal point inside the {self.width} x {self.height} "
-                f"image, got ({u:.1f}, {v:.1f}); K belongs to another resolution: give the size "
-                "that was calibrated (--size), and the size of the images with --rescale"
+
+    def check_centre(self) -> None:
+        """Raises where K is that of another resolution.
+
+        Raises:
+          ImageSizeError: the principal point is further off the middle than `off_centre`.
+        """
+        advice = (
+            "K belongs to another resolution: give the size that was calibrated (--size), and the "
+            "size of the images with --rescale; for images cropped to one side: --off-centre SHARE"
+        )
+        try:
+            check_centre(
+                self.K, self.height, self.width, self.off_centre, f"cameras.{self.name}.K", advice
             )
+        except CameraError as error:
+            raise ImageSizeError(str(error)) from error
 
     def camera(self, episode: str | None = None) -> Camera:
         """The pinhole camera of the upright, undistorted images of an episode."""
@@ -171,7 +215,8 @@ class CameraCalibration:
             raise ImageSizeError(
                 f"cameras.{self.name}: expected images of {width} x {height} pixels (width x "
                 f"height), as calibrated, got {got_width} x {got_height}; if they were resized: "
-                f"`data calibrate --from palm --file C --rescale {got_width} {got_height} --out N`"
+                f"`data calibrate --from palm --file C --camera {shlex.quote(self.name)} --rescale "
+                f"{got_width} {got_height} --out NEW`"
                 f"{also}"
             )
         return FLIPS[self.flip](images)
@@ -187,6 +232,9 @@ class RobotKeys:
       opening: key (or `key[a:b]`) of the gripper.
       closed, open: its value when closed and when open (the mean of the absolute values, if there
         are several).
+
+    Raises:
+      CalibrationError: a value of another kind.
     """
 
     pose: str | None = None
@@ -194,6 +242,21 @@ class RobotKeys:
     opening: str | None = None
     closed: float | None = None
     open: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("pose", "rotation", "opening"):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, str):
+                raise CalibrationError(f"robot.{name}: expected a text, got {value!r}")
+        for name in ("closed", "open"):
+            value = getattr(self, name)
+            if value is not None and not is_number(value):
+                raise CalibrationError(f"robot.{name}: expected a finite number, got {value!r}")
+        if self.rotation is not None and self.rotation not in rotations.NAMES:
+            raise CalibrationError(
+                f"robot.rotation: expected one of {', '.join(rotations.NAMES)}; got "
+                f"{self.rotation!r}"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,7 +278,22 @@ class Calibration:
     def __post_init__(self) -> None:
         if not self.cameras:
             raise CalibrationError("cameras: expected at least one, got none")
+        for camera in self.cameras.values():
+            camera.check_centre()
         _checked_pose(self.ee_to_tcp, "T_ee_tcp")
+
+    def camera(self, name: str) -> CameraCalibration:
+        """A camera by its name.
+
+        Raises:
+          CameraNameError: not in the calibration.
+        """
+        if name not in self.cameras:
+            raise CameraNameError(
+                f"camera {name!r} is not in the calibration, which has "
+                f"{', '.join(sorted(self.cameras))}"
+            )
+        return self.cameras[name]
 
     def find(self, name: str | None, image_keys: Iterable[str]) -> tuple[CameraCalibration, str]:
         """A camera of this calibration and the key of its images.
@@ -228,13 +306,7 @@ class Calibration:
           CameraNameError: not in the calibration, without images, or several to choose from.
         """
         keys = list(image_keys)
-        if name is not None and name not in self.cameras:
-            raise CameraNameError(
-                f"camera {name!r} is not in the calibration, which has "
-                f"{', '.join(sorted(self.cameras))}; the file has images "
-                f"{', '.join(keys) or '(none)'}"
-            )
-        wanted = [name] if name is not None else list(self.cameras)
+        wanted = [self.camera(name).name] if name is not None else list(self.cameras)
         found = {n: key for n in wanted if (key := image_key(self.cameras[n], keys)) is not None}
         if len(found) == 1:
             ((only, key),) = found.items()
@@ -249,6 +321,21 @@ class Calibration:
             'the key of its images as "image"'
         )
 
+    def renumbered(self, numbers: Mapping[str, str]) -> Calibration:
+        """The same for a file whose episodes have other names.
+
+        Args:
+          numbers: old name -> new name of the episodes that are still there.
+        """
+
+        def moved(camera: CameraCalibration) -> CameraCalibration:
+            poses = camera.by_episode.items()
+            kept = {numbers[name]: pose for name, pose in poses if name in numbers}
+            return dataclasses.replace(camera, by_episode=kept)
+
+        cameras = {name: moved(camera) for name, camera in self.cameras.items()}
+        return dataclasses.replace(self, cameras=cameras)
+
     def to_json(self) -> dict[str, Any]:
         """The content of the file."""
         cameras = {
@@ -262,6 +349,7 @@ class Calibration:
                 "image": camera.image,
                 "T_base_cam": camera.cam_to_base,
                 "by_episode": camera.by_episode,
+                "off_centre": camera.off_centre,
             }
             for name, camera in self.cameras.items()
         }
@@ -290,7 +378,8 @@ def short_names(key: str) -> set[str]:
     last = key.split("/")[-1]
     for prefix in ("observation.images.", "observation.image.", "observation."):
         last = last.removeprefix(prefix)
-    return {key, last, *(last.removesuffix(end) for end in ("_image", "_rgb", ".image", ".rgb"))}
+    ends = ("_image", "_rgb", ".image", ".rgb")
+    return {key, last, *(last.removesuffix(end) for end in ends)} - {""}
 
 
 def image_key(camera: CameraCalibration, keys: Iterable[str]) -> str | None:
@@ -354,21 +443,22 @@ def from_json(content: Any) -> Calibration:
             f"axes: expected 'opencv' (x right, y down, z forward), got {content.get('axes')!r}; "
             "`data calibrate --axes opengl|coppelia` converts"
         )
-    cameras = content.get("cameras")
-    if not isinstance(cameras, dict):
-        raise CalibrationError(f"cameras: expected an object, got {type(cameras).__name__}")
+    cameras = _object(content.get("cameras"), "cameras")
+    robot = _object(content.get("robot") or {}, "robot")
+    unknown = set(robot) - {field.name for field in dataclasses.fields(RobotKeys)}
+    if unknown:
+        raise CalibrationError(f"robot: unknown entries {', '.join(sorted(unknown))}")
     return Calibration(
         {name: _camera(name, entry) for name, entry in cameras.items()},
         _array(content.get("T_ee_tcp", np.eye(4).tolist()), "T_ee_tcp"),
-        _robot(_object(content.get("robot"), "robot")),
+        RobotKeys(**robot),
         str(content.get("made_from", "")),
     )
 
 
 def _camera(name: str, entry: Any) -> CameraCalibration:
     where = f"cameras.{name}"
-    if not isinstance(entry, dict):
-        raise CalibrationError(f"{where}: expected an object, got {type(entry).__name__}")
+    entry = _object(entry, where)
     if entry.get("mount", "static") != "static":
         raise CalibrationError(
             f"{where}.mount: expected 'static', got {entry['mount']!r}; PALM aligns the images of "
@@ -377,9 +467,7 @@ def _camera(name: str, entry: Any) -> CameraCalibration:
     for key in ("K", "width", "height", "T_base_cam"):
         if entry.get(key) is None:
             raise CalibrationError(f"{where}.{key}: missing")
-    dist, image = entry.get("dist"), entry.get("image")
-    if not isinstance(image, str | None):
-        raise CalibrationError(f"{where}.image: expected a key of the data, got {image!r}")
+    dist = entry.get("dist")
     return CameraCalibration(
         name=name,
         K=_array(entry["K"], f"{where}.K"),
@@ -388,33 +476,21 @@ def _camera(name: str, entry: Any) -> CameraCalibration:
         cam_to_base=_array(entry["T_base_cam"], f"{where}.T_base_cam"),
         dist=None if dist is None else tuple(_array(dist, f"{where}.dist").ravel().tolist()),
         flip=entry.get("flip", "none"),
-        image=image,
+        image=entry.get("image"),
         by_episode={
             episode: _array(pose, f"{where}.by_episode.{episode}")
-            for episode, pose in _object(entry.get("by_episode"), f"{where}.by_episode").items()
+            for episode, pose in _object(
+                entry.get("by_episode") or {}, f"{where}.by_episode"
+            ).items()
         },
+        off_centre=entry.get("off_centre", OFF_CENTRE),
     )
 
 
-def _robot(entry: Mapping[str, Any]) -> RobotKeys:
-    texts, numbers = ("pose", "rotation", "opening"), ("closed", "open")
-    unknown = set(entry) - {*texts, *numbers}
-    if unknown:
-        raise CalibrationError(f"robot: unknown entries {', '.join(sorted(unknown))}")
-    for name, value in entry.items():
-        if name in texts and not isinstance(value, str | None):
-            raise CalibrationError(f"robot.{name}: expected a text or null, got {value!r}")
-        if name in numbers and value is not None:
-            if isinstance(value, bool) or _array(value, f"robot.{name}").shape != ():
-                raise CalibrationError(f"robot.{name}: expected a number or null, got {value!r}")
-    return RobotKeys(**entry)
-
-
-def _object(value: Any, where: str) -> Mapping[str, Any]:
-    """A JSON object, empty for null."""
-    if not isinstance(value, dict | None):
+def _object(value: Any, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
         raise CalibrationError(f"{where}: expected an object, got {type(value).__name__}")
-    return value or {}
+    return value
 
 
 def _array(value: Any, where: str) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import shlex
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -13,11 +14,15 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from palm_jax.align import AlignSpec, Camera, tcp_overlay, undistort
-from palm_jax.train.data import motion
+from palm_jax.train.data import motion, output
+from palm_jax.train.data.calibration import CameraCalibration
 from palm_jax.train.data.errors import (
     DataError,
+    FormatError,
     ImageOrientationError,
     KeyMissingError,
+    OutputError,
+    ReprojectionError,
     TcpOutOfViewError,
 )
 from palm_jax.train.data.motion import Motion, Reading
@@ -29,9 +34,16 @@ from palm_jax.train.data.recording import (
     inside,
     projected,
 )
+from palm_jax.train.data.source import Source
 from palm_jax.train.metrics import write_atomic
 
 PANELS, COLUMNS, PANEL, CAPTION = 12, 4, 320, 22
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+LEAST_PIXELS, PIXELS_SHARE = 3.0, 0.01
+"""How far from measured pixels the TCP may be computed, in pixels, and as a share of the image's
+larger side: more than the error of a careful measurement, less than any mistake."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +52,7 @@ class Reprojection:
 
     frames: int
     mean: float
+    median: float
     most: float
     key: str
 
@@ -77,13 +90,32 @@ def check(
     """
     survey = recording.survey()
     evidence = motion.examine(recording)
+    found = reprojection(recording, pixels)
     problem: DataError | None = None
     try:
         check_view(recording, survey, least=least)
-        check_orientation(recording, evidence)
+        recording.check_opening(survey)
+        check_fit(recording, evidence, found)
     except DataError as error:
         problem = error
-    return Report(survey, evidence, reprojection(recording, pixels), problem)
+    return Report(survey, evidence, found, problem)
+
+
+def check_fit(recording: Recording, evidence: Motion, found: Reprojection | None) -> None:
+    """Raises where the images, or pixels measured in them, contradict the calibration.
+
+    Measured pixels weigh more: what the motion of the images advises must fit them.
+
+    Raises:
+      ImageOrientationError, TcpOutOfViewError: see `check_orientation`.
+      ReprojectionError: see `check_reprojection`.
+    """
+    if evidence.wrong and found is not None:
+        mended = reprojection(recording, found.key, evidence.best.reading)
+        if mended is not None and mended.median > _most_pixels(recording.camera):
+            check_reprojection(recording, found)
+    check_orientation(recording, evidence)
+    check_reprojection(recording, found)
 
 
 def check_orientation(recording: Recording, evidence: Motion) -> None:
@@ -101,7 +133,8 @@ def check_orientation(recording: Recording, evidence: Motion) -> None:
     raise kind(
         f"{where}: the images move elsewhere than the TCP (correlation "
         f"{evidence.as_is.score:.2f}), but fit if {told(best.reading, camera.flip)} "
-        f"({best.score:.2f}, {best.better:.0f} standard errors better). {remedy(best.reading)}; "
+        f"({best.score:.2f}, {best.better:.0f} standard errors better). "
+        f"{remedy(best.reading, camera.name)}; "
         "look at the sheet of `data check` (--trust if you know better)"
     )
 
@@ -130,42 +163,119 @@ def told(reading: Reading, flip: str = "none") -> str:
     return " and ".join(words) or "the calibration is taken as it is"
 
 
-def remedy(reading: Reading) -> str:
-    """The command that mends a calibration."""
+def remedy(reading: Reading, name: str) -> str:
+    """What mends the calibration of a camera: a command, or the options to import it with."""
+    options = f"--flip {reading.flip}"
+    options += f" --axes {reading.axes}" if reading.axes != "opencv" else ""
+    options += " --inverse" if reading.inverse else ""
     if reading.euler:
-        return f"Import the camera again with --euler {reading.euler}"
-    options = [f"--flip {reading.flip}"]
-    options += [f"--axes {reading.axes}"] if reading.axes != "opencv" else []
-    options += ["--inverse"] if reading.inverse else []
-    return f"`data calibrate --from palm --file C {' '.join(options)} --out NEW` mends it"
+        return f"Import the camera again with --euler {reading.euler} {options}"
+    return (
+        f"`data calibrate --from palm --file C --camera {shlex.quote(name)} {options} --out NEW` "
+        "mends it"
+    )
 
 
-def reprojection(recording: Recording, pixels: str | None = None) -> Reprojection | None:
+def reprojection(
+    recording: Recording, pixels: str | None = None, reading: Reading | None = None
+) -> Reprojection | None:
     """Distances to measured pixels, or None where the file has none.
+
+    Args:
+      recording: the data with its calibration.
+      pixels: see `check`.
+      reading: of the calibration; None: as it is.
 
     Raises:
       KeyMissingError: `pixels` is not a key of the file.
+      FormatError: the key holds something else.
     """
     source, camera = recording.source, recording.camera
+    reading = reading or Reading(camera.flip)
     try:
         key = source.resolve(pixels or f"{camera.name}_tcp_uv")
     except KeyMissingError:
         if pixels is not None:
             raise
         return None
-    distances = []
+    computed, measured = [], []
     for name in source.episodes:
-        uv, _ = projected(camera.camera(name), recording.trajectory(name).tcp[:, :3, 3])
-        stored = motion.stored_uv(camera.flip, uv, camera.width, camera.height)
-        distances.append(np.linalg.norm(stored - source.numbers(name, key), axis=1))
-    every = np.concatenate(distances)
+        points = recording.trajectory(name).tcp[:, :3, 3]
+        uv, _ = projected(motion.camera_as(camera, name, reading), points)
+        computed.append(uv)
+        measured.append(_measured(source, name, key, len(uv)))
+    stored = motion.seen_uv(camera, np.concatenate(computed), reading.flip)
+    every = np.linalg.norm(stored - np.concatenate(measured), axis=1)
     seen = every[np.isfinite(every)]
     if not len(seen):
         return None
-    return Reprojection(len(seen), float(seen.mean()), float(seen.max()), key)
+    return Reprojection(
+        len(seen), float(seen.mean()), float(np.median(seen)), float(seen.max()), key
+    )
+
+
+def _measured(source: Source, episode: str, key: str, length: int) -> np.ndarray:
+    """[length, 2] pixels.
+
+    Raises:
+      FormatError: the key holds something else.
+    """
+    values = source.numbers(episode, key)
+    if values.shape != (length, 2):
+        raise FormatError(
+            f"{source.path}: {episode}: expected {length} x 2 measured pixels in {key}, got "
+            f"{' x '.join(map(str, values.shape))}; name another key: --pixels, or --trust"
+        )
+    return values
+
+
+def _most_pixels(camera: CameraCalibration) -> float:
+    return max(LEAST_PIXELS, PIXELS_SHARE * max(camera.width, camera.height))
+
+
+def check_reprojection(recording: Recording, found: Reprojection | None) -> None:
+    """Raises where the TCP is computed elsewhere than it was measured.
+
+    Raises:
+      ReprojectionError: with the distance and what can be the reason.
+    """
+    camera, most = recording.camera, _most_pixels(recording.camera)
+    if found is None or found.median <= most:
+        return
+    raise ReprojectionError(
+        f"{recording.source.path} with camera {camera.name!r}: expected the TCP within {most:.1f} "
+        f"px of the measured pixels {found.key}, got {found.median:.1f} px (median of "
+        f"{found.frames} frames): K belongs to another resolution or lens, the camera stood "
+        "elsewhere, or the pixels are of something else (--trust if you know better)"
+    )
 
 
 # -- the sheet -------------------------------------------------------------------------------------
+
+
+def check_sheet(path: Path, source: Path) -> None:
+    """Raises where a sheet would replace anything but an older one.
+
+    Args:
+      path: of the sheet.
+      source: the data.
+
+    Raises:
+      OutputError: no PNG; in the source's folder.
+    """
+    output.check_outside(path, source)
+    if path.exists() and not _is_png(path):
+        raise OutputError(
+            f"{path} exists and is no PNG; a sheet replaces only an older sheet: choose another "
+            "--out"
+        )
+
+
+def _is_png(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(_PNG)) == _PNG
 
 
 def sheet(recording: Recording, report: Report, spec: AlignSpec, path: Path) -> Path:
@@ -237,9 +347,7 @@ def _panel(
     recording: Recording, reading: Reading, spec: AlignSpec, name: str, index: int
 ) -> Image.Image:
     calibrated = dataclasses.replace(recording.camera, flip=reading.flip)
-    camera = calibrated.camera(name)
-    pose = motion.pose_as(np.asarray(camera.cam_to_world, float), reading)
-    camera = dataclasses.replace(camera, cam_to_world=pose.astype(np.float32))
+    camera = motion.camera_as(calibrated, name, reading)
     stored = recording.source.image(name, recording.image_key, index)
     image = np.ascontiguousarray(calibrated.upright(stored))
     if recording.camera.dist is not None:

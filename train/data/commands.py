@@ -35,6 +35,7 @@ from palm_jax.train.data import aligning, check, importers, inspection, job, sou
 from palm_jax.train.data import calibration as calib
 from palm_jax.train.data.calibration import Calibration, CameraCalibration, RobotKeys
 from palm_jax.train.data.errors import CalibrationError, DataError, OutputError, disk_full
+from palm_jax.train.data.headers import is_number
 from palm_jax.train.data.recording import LEAST_IN_VIEW, Recording, open_recording
 from palm_jax.train.data.source import Source, open_source
 
@@ -101,7 +102,8 @@ class Calibrate:
         calibration.json, to change it).
       out: the new file; nothing is overwritten.
       file: what to read, see `from`.
-      camera: names; by default all that have images (npy, droid: one name is needed).
+      camera: names; by default all that have images (npy, droid: one name is needed; palm: those to
+        change, the others stay as they are).
       size: width and height of the images that K describes, if no file tells.
       K: npy, droid: fx,fy,cx,cy or a .npy file of 3 x 3.
       extrinsics: npy: a .npy file of 4 x 4; droid: x,y,z and three angles.
@@ -112,6 +114,8 @@ class Calibrate:
       pixel_origin: what (0, 0) is in K: the corner of the first pixel (renderers), or its centre
         (OpenCV's calibration), which is half a pixel away.
       flip: what turns the stored images upright.
+      off_centre: how far K's principal point may lie from the middle, as a share of the image, 0.15
+        unless told otherwise: more for images that were cropped to one side.
       rescale: width and height to which the images were resized since.
       image: key of the camera's images, where its name does not tell.
       pose: key of the hand's pose, KEY[a:b] or several joined with +.
@@ -139,6 +143,7 @@ class Calibrate:
     dist: str | None = None
     pixel_origin: Literal["corner", "centre"] = "corner"
     flip: Flip | None = None
+    off_centre: float | None = None
     rescale: tuple[int, int] | None = None
     image: str | None = None
     pose: str | None = None
@@ -159,20 +164,55 @@ def make_calibration(config: Calibrate) -> Calibration:
     Raises:
       CalibrationError, DataError: see `importers`.
     """
+    _check_used(config)
     old = None
     if config.from_ == "palm":
         old = calib.load(_file(config))
         made_from = old.made_from
-        cameras = {name: _changed_pose(camera, config) for name, camera in old.cameras.items()}
+        cameras = {
+            name: _changed_pose(old.camera(name), config) for name in config.camera or old.cameras
+        }
     else:
         cameras = _imported(config)
         made_from = f"{config.from_}: {config.file.name if config.file else 'numbers'}"
-    cameras = {name: _changed(camera, config) for name, camera in cameras.items()}
+    if config.image is not None and len(cameras) > 1:
+        raise CalibrationError(
+            f"--image names the images of one camera, not of {', '.join(cameras)}; choose it with "
+            "--camera"
+        )
+    kept = old.cameras if old is not None else {}
+    cameras = {**kept, **{name: _changed(camera, config) for name, camera in cameras.items()}}
     before = old.robot if old is not None else RobotKeys()
     given = {f.name: getattr(config, f.name) for f in dataclasses.fields(RobotKeys)}
     robot = dataclasses.replace(before, **{k: v for k, v in given.items() if v is not None})
     tcp = old.ee_to_tcp if old is not None else np.eye(4)
     return Calibration(cameras, _tcp(config, tcp), robot, made_from)
+
+
+_USED = {
+    "robosuite": {"size"},
+    "mujoco": {"size"},
+    "maniskill": {"size"},
+    "droid": {"size", "K", "extrinsics", "euler", "inverse", "axes"},
+    "npy": {"size", "K", "extrinsics", "inverse", "axes"},
+    "palm": {"inverse", "axes"},
+}
+"""Options that not every importer uses."""
+
+
+def _check_used(config: Calibrate) -> None:
+    """Raises for an option that would have no effect.
+
+    Raises:
+      CalibrationError: with what uses it.
+    """
+    for field in dataclasses.fields(config):
+        users = [kind for kind, used in _USED.items() if field.name in used]
+        if users and config.from_ not in users and getattr(config, field.name) != field.default:
+            raise CalibrationError(
+                f"--{field.name}: --from {config.from_} does not use it, only {', '.join(users)}; "
+                "leave it out, or change the finished calibration with --from palm"
+            )
 
 
 def _file(config: Calibrate) -> Path:
@@ -197,7 +237,7 @@ def _changed_pose(camera: CameraCalibration, config: Calibrate) -> CameraCalibra
         return camera
 
     def change(pose: np.ndarray) -> np.ndarray:
-        return (importers.inverted(pose) if config.inverse else pose) @ calib.AXES[config.axes]
+        return calib.as_opencv(pose, config.axes, config.inverse)
 
     return dataclasses.replace(
         camera,
@@ -210,10 +250,9 @@ def _changed(camera: CameraCalibration, config: Calibrate) -> CameraCalibration:
     changes: dict[str, Any] = {}
     if config.pixel_origin == "centre":
         changes["K"] = camera.K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    if config.flip is not None:
-        changes["flip"] = config.flip
-    if config.image is not None:
-        changes["image"] = config.image
+    for name in ("flip", "image", "off_centre"):
+        if getattr(config, name) is not None:
+            changes[name] = getattr(config, name)
     if config.dist is not None:
         numbers = importers.numbers_or_file(config.dist, "--dist").ravel()
         changes["dist"] = tuple(numbers.tolist())
@@ -321,7 +360,8 @@ class Check:
       file: robomimic HDF5 file, or folder of a LeRobot v3 data set.
       calibration: calibration.json.
       camera: name; by default the only one with images.
-      out: the sheet of overlays; by default FILE-CAMERA.png in the current folder.
+      out: the sheet of overlays; by default FILE-CAMERA.png in the current folder. It replaces an
+        older sheet, nothing else.
       least_in_view: share of frames that must show the TCP.
       pixels: key of measured pixels of the TCP; by default CAMERA_tcp_uv, if there is one.
     """
@@ -336,8 +376,9 @@ class Check:
 
 def run_check(config: Check, console: Console) -> int:
     with open_recording(config.file, config.calibration, camera=config.camera) as recording:
-        report = check.check(recording, least=config.least_in_view, pixels=config.pixels)
         out = config.out or Path(f"{config.file.stem}-{recording.camera.name}.png")
+        check.check_sheet(out, config.file)
+        report = check.check(recording, least=config.least_in_view, pixels=config.pixels)
         spec = aligning.paper_spec(recording.camera.height)
         with disk_full(out, "the sheet was not written"):
             check.sheet(recording, report, spec, out)
@@ -354,6 +395,8 @@ def _print_report(console: Console, recording: Recording, report: check.Report) 
         f"{survey.worst} ({survey.worst_share:.1%})",
         markup=False,
     )
+    low, high = survey.opening
+    console.print(f"gripper: {recording.keys.opening}, {low:.0%} to {high:.0%} open", markup=False)
     if report.reprojection is not None:
         error = report.reprojection
         console.print(
@@ -420,7 +463,8 @@ class Align:
         was there is kept as source_*.
       transitions: frames with so many largest motions of an episode become the identity.
       least_in_view: share of frames that must show the TCP.
-      trust: skip looking at the images for a wrong calibration.
+      trust: skip looking at the images, at pixels measured in them and at the gripper's range for a
+        wrong calibration.
     """
 
     file: File
@@ -475,10 +519,22 @@ def _spec_json(text: str | None) -> dict[str, Any]:
         content = json.loads(text if text.lstrip().startswith("{") else Path(text).read_text())
     except (OSError, ValueError) as error:
         raise DataError(f"--spec: expected JSON or a file of it ({error})") from error
-    known = {field.name for field in dataclasses.fields(AlignSpec)}
-    if not isinstance(content, dict) or not set(content) <= known:
+    known = {field.name: field.default for field in dataclasses.fields(AlignSpec)}
+    if not isinstance(content, dict) or not set(content) <= set(known):
         raise DataError(f"--spec: expected an object with some of {', '.join(sorted(known))}")
+    for name, value in content.items():
+        if not (_like(value, known[name]) or (name == "crop" and value is None)):
+            raise DataError(f"--spec: {name}: expected a value like {known[name]!r}, got {value!r}")
     return content
+
+
+def _like(value: Any, default: Any) -> bool:
+    """Whether a value of JSON is of a default's kind; a whole number is also a number."""
+    if isinstance(default, tuple):
+        return isinstance(value, list) and len(value) == len(default) and all(map(is_number, value))
+    if isinstance(default, float):
+        return is_number(value)
+    return type(value) is type(default)
 
 
 def run_align(config: Align, console: Console) -> int:
@@ -523,18 +579,28 @@ class Verify:
 
 
 def run_verify(config: Verify, console: Console) -> int:
-    problems = soundness.verify(config.file, robot=_robot(config.calibration))
+    robot = _robot(config.calibration)
+    problems = soundness.verify(config.file, robot=robot)
+    _print_unread(config.file, robot, console)
     for name, texts in problems.items():
         for text in texts:
             console.print(f"{name or config.file}: {text}", markup=False)
     if problems:
-        advice = (
-            f"`python -m palm_jax data repair {config.file} --out NEW` saves the sound episodes"
+        told = f" --calibration {config.calibration}" if config.calibration is not None else ""
+        console.print(
+            f"`python -m palm_jax data repair {config.file}{told} --out NEW` saves the sound "
+            "episodes",
+            markup=False,
         )
-        console.print(advice, markup=False)
         return 1
     console.print(f"{config.file}: sound", markup=False)
     return 0
+
+
+def _print_unread(path: Path, robot: RobotKeys | None, console: Console) -> None:
+    reason = soundness.unread(path, robot=robot)
+    if reason:
+        console.print(f"note: poses were not looked at; pass --calibration. {reason}", markup=False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -553,11 +619,40 @@ class Repair:
 
 
 def run_repair(config: Repair, console: Console) -> int:
-    result = soundness.repair(config.file, config.out, robot=_robot(config.calibration))
+    calibration = None if config.calibration is None else calib.load(config.calibration)
+    robot = None if calibration is None else calibration.robot
+    result = soundness.repair(config.file, config.out, robot=robot)
+    _print_unread(config.file, robot, console)
     for name, reason in result.dropped.items():
         console.print(f"left out {name}: {reason}", markup=False)
     console.print(f"{len(result.kept)} episodes written: {result.path}", markup=False)
+    if any(old != new for old, new in result.numbers.items()):
+        _follow_numbers(result, calibration, console)
     return 0
+
+
+def _follow_numbers(
+    result: soundness.Repair, calibration: Calibration | None, console: Console
+) -> None:
+    """Says how LeRobot's episodes are numbered anew, and lets the calibration follow."""
+    numbers, meta = result.numbers, result.path / "meta"
+    pairs = [f"{old} is now {new}" for old, new in numbers.items() if old != new]
+    told = ", ".join(pairs[:3]) + (", ..." if len(pairs) > 3 else "")
+    console.print(f"episodes are numbered anew: {told} (all in {meta / 'palm.json'})", markup=False)
+    if calibration is None:
+        console.print(
+            "a calibration with poses by_episode must follow: repeat with --calibration C",
+            markup=False,
+        )
+        return
+    for camera in calibration.cameras.values():
+        for name in camera.by_episode:
+            now = f"is now {numbers[name]}" if name in numbers else "was left out"
+            console.print(f"cameras.{camera.name}.by_episode: {name} {now}", markup=False)
+    path = meta / "calibration.json"
+    with disk_full(path, "the episodes are written, their calibration is not"):
+        calib.save(calibration.renumbered(numbers), path)
+    console.print(f"written: {path}, for the new numbers", markup=False)
 
 
 def _robot(calibration: Path | None) -> RobotKeys | None:

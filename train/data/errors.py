@@ -60,6 +60,10 @@ class ImageOrientationError(CalibrationError):
     """The images are mirrored, upside down or turned against the calibration."""
 
 
+class ReprojectionError(CalibrationError):
+    """The TCP is computed elsewhere than it was measured in the images."""
+
+
 class PoseDataError(DataError):
     """Poses that are not finite or not rigid."""
 

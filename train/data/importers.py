@@ -19,7 +19,12 @@ import mujoco
 import numpy as np
 
 from palm_jax.train.data import rotations
-from palm_jax.train.data.calibration import AXES, CameraCalibration, image_key
+from palm_jax.train.data.calibration import (
+    CameraCalibration,
+    as_opencv,
+    image_key,
+    short_names,
+)
 from palm_jax.train.data.errors import (
     CalibrationError,
     CameraNameError,
@@ -36,16 +41,6 @@ Size = tuple[int, int]  # width, height
 
 # Poses of one camera that differ by less are the same: files store float32.
 _SAME = 1e-5
-
-
-def inverted(pose: np.ndarray) -> np.ndarray:
-    """The inverse of rigid poses [..., 4, 4]."""
-    rotation = np.swapaxes(pose[..., :3, :3], -1, -2)
-    result = np.zeros_like(pose)
-    result[..., :3, :3] = rotation
-    result[..., :3, 3] = -(rotation @ pose[..., :3, 3:])[..., 0]
-    result[..., 3, 3] = 1.0
-    return result
 
 
 def intrinsics_of(fovy: float, width: int, height: int) -> np.ndarray:
@@ -72,18 +67,30 @@ def with_images(source: Source, names: Sequence[str]) -> list[str]:
     """
     if names:
         return list(names)
-    found = [
-        name
-        for key in source.image_keys
-        for name in (key.split("/")[-1].removesuffix("_image").removesuffix("_rgb"),)
-    ]
+    found = [min(short_names(key), key=len) for key in source.image_keys]
     if not found:
         raise CameraNameError(f"{source.path} has no images; name the cameras with --camera")
     return found
 
 
-def _merged(name: str, K: np.ndarray, size: Size, poses: Mapping[str, np.ndarray]) -> Any:
-    """One camera from its pose in every episode."""
+def _merged(
+    name: str,
+    matrices: Mapping[str, np.ndarray],
+    size: Size,
+    poses: Mapping[str, np.ndarray],
+) -> CameraCalibration:
+    """One camera from its intrinsics and its pose in every episode.
+
+    Raises:
+      CalibrationError: the intrinsics differ.
+    """
+    first, K = next(iter(matrices.items()))
+    for episode, matrix in matrices.items():
+        if matrix.shape != K.shape or not np.allclose(matrix, K, rtol=_SAME, atol=_SAME):
+            raise CalibrationError(
+                f"{name}: expected the same K in every episode, got {K.tolist()} in {first} and "
+                f"{matrix.tolist()} in {episode}; split the file into those that share it"
+            )
     usual = next(iter(poses.values()))
     other = {episode: pose for episode, pose in poses.items() if np.abs(pose - usual).max() > _SAME}
     return CameraCalibration(name, K, *size, usual, by_episode=other)
@@ -121,8 +128,7 @@ def from_robosuite(source: Source, names: Sequence[str], size: Size | None) -> C
 
 
 def _camera_info(source: Source, name: str, size: Size | None) -> CameraCalibration:
-    poses = {}
-    matrix: np.ndarray | None = None
+    poses, matrices = {}, {}
     for episode in source.episodes:
         info = source.camera_info(episode)
         if name not in info:
@@ -132,13 +138,12 @@ def _camera_info(source: Source, name: str, size: Size | None) -> CameraCalibrat
             )
         if "eye_in_hand" in name:
             raise CalibrationError(f"{name}: a wrist camera moves with the TCP; PALM needs none")
-        matrix = matrix if matrix is not None else np.asarray(info[name]["intrinsics"], float)
+        matrices[episode] = np.asarray(info[name]["intrinsics"], float)
         poses[episode] = np.asarray(info[name]["extrinsics"], float)
-    assert matrix is not None
     size = size or image_size(source, name)
     if size is None:
         raise CameraNameError(f"{source.path}: no images of {name!r}; give their --size")
-    return _merged(name, matrix, size, poses)
+    return _merged(name, matrices, size, poses)
 
 
 # -- MuJoCo ----------------------------------------------------------------------------------------
@@ -168,17 +173,18 @@ def from_models(
 ) -> Cameras:
     """See `from_mujoco`, for one model an episode."""
     found: dict[str, dict[str, np.ndarray]] = {}
-    fovy: dict[str, float] = {}
+    fovy: dict[str, dict[str, float]] = {}
     for episode, xml in models.items():
         for name, (pose, angle) in _fixed_cameras(xml, names).items():
-            found.setdefault(name, {})[episode] = pose @ AXES["opengl"]
-            fovy[name] = angle
+            found.setdefault(name, {})[episode] = as_opencv(pose, "opengl", False)
+            fovy.setdefault(name, {})[episode] = angle
     cameras = {}
     for name, poses in found.items():
         size = sizes.get(name) or default
         if size is None:
             raise CalibrationError(f"{name}: give the size of its images: --size WIDTH HEIGHT")
-        cameras[name] = _merged(name, intrinsics_of(fovy[name], *size), size, poses)
+        matrices = {episode: intrinsics_of(angle, *size) for episode, angle in fovy[name].items()}
+        cameras[name] = _merged(name, matrices, size, poses)
     return cameras
 
 
@@ -267,13 +273,17 @@ Sensor = dict[str, dict[str, np.ndarray]]  # episode -> array name -> values
 
 
 def _sensor(name: str, episodes: Sensor, size: Size) -> CameraCalibration:
-    poses = {}
+    poses, matrices = {}, {}
     for episode, arrays in episodes.items():
         pose = None
+        if "intrinsic_cv" in arrays:
+            matrices[episode] = _still(arrays["intrinsic_cv"], f"{name}.intrinsic_cv")
         if "extrinsic_cv" in arrays:
-            pose = inverted(_square(_still(arrays["extrinsic_cv"], f"{name}.extrinsic_cv")))
+            pose = _square(_still(arrays["extrinsic_cv"], f"{name}.extrinsic_cv"))
+            pose = as_opencv(pose, "opencv", True)
         if "cam2world_gl" in arrays:
-            other = _still(arrays["cam2world_gl"], f"{name}.cam2world_gl") @ AXES["opengl"]
+            other = _still(arrays["cam2world_gl"], f"{name}.cam2world_gl")
+            other = as_opencv(other, "opengl", False)
             if pose is not None and np.abs(pose - other).max() > 1e-3:
                 raise CalibrationError(
                     f"{name}: extrinsic_cv (world to camera, OpenCV) and cam2world_gl (pose, "
@@ -283,10 +293,9 @@ def _sensor(name: str, episodes: Sensor, size: Size) -> CameraCalibration:
             pose = other if pose is None else pose
         if pose is not None:
             poses[episode] = pose
-    first = next(iter(episodes.values()))
-    if not poses or "intrinsic_cv" not in first:
+    if not poses or not matrices:
         raise CalibrationError(f"{name}: needs intrinsic_cv, and extrinsic_cv or cam2world_gl")
-    return _merged(name, _still(first["intrinsic_cv"], f"{name}.intrinsic_cv"), size, poses)
+    return _merged(name, matrices, size, poses)
 
 
 def _still(values: np.ndarray, where: str) -> np.ndarray:
@@ -403,7 +412,7 @@ def from_droid(
         if np.abs(vectors - vectors[0]).max() > 1e-4:
             raise CalibrationError(f"{key}: the camera moves in {episode}")
         poses[episode] = vector_pose(vectors[0], euler)
-    return {name: _merged(name, K, size, poses)}
+    return {name: _merged(name, {"": K}, size, poses)}
 
 
 def _extrinsics_key(source: Source, name: str) -> str:
@@ -425,7 +434,6 @@ def from_arrays(
     *,
     axes: str = "opencv",
     inverse: bool = False,
-    dist: Sequence[float] | None = None,
 ) -> Cameras:
     """From a matrix of intrinsics and one of extrinsics.
 
@@ -436,7 +444,6 @@ def from_arrays(
       size: of the images.
       axes: of the camera, a key of `calibration.AXES`.
       inverse: `pose` maps the base into the camera.
-      dist: lens coefficients, OpenCV's.
 
     Raises:
       CalibrationError: not such matrices.
@@ -444,10 +451,8 @@ def from_arrays(
     pose = np.asarray(pose, float)
     if pose.shape not in ((4, 4), (3, 4)):
         raise CalibrationError(f"--extrinsics: expected 4 x 4 or 3 x 4 numbers, got {pose.shape}")
-    pose = _square(pose)
-    pose = (inverted(pose) if inverse else pose) @ AXES[axes]
-    coefficients = None if dist is None else tuple(float(value) for value in dist)
-    return {name: CameraCalibration(name, np.asarray(K, float), *size, pose, coefficients)}
+    pose = as_opencv(_square(pose), axes, inverse)
+    return {name: CameraCalibration(name, np.asarray(K, float), *size, pose)}
 
 
 def numbers_or_file(text: str, where: str) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from palm_jax.train.data.calibration import RobotKeys
 from palm_jax.train.data.errors import DataError
-from palm_jax.train.data.recording import robot_keys
+from palm_jax.train.data.recording import openness, range_problem, robot_keys
 from palm_jax.train.data.source import Source
 
 
@@ -51,6 +51,7 @@ def inspect(source: Source) -> Overview:
     robot = None
     try:
         robot = robot_keys(source, RobotKeys())
+        notes += _gripper_notes(source, first, robot)
     except DataError as error:
         notes.append(str(error).removeprefix(f"{source.path}: "))
     return Overview(
@@ -66,6 +67,17 @@ def inspect(source: Source) -> Overview:
         robot=robot,
         notes=tuple(notes),
     )
+
+
+def _gripper_notes(source: Source, episode: str, robot: RobotKeys) -> list[str]:
+    """Whether the range that a known key stands for is that of this gripper."""
+    assert robot.opening
+    opening = openness(robot, source.columns(episode, robot.opening))
+    opening = opening[np.isfinite(opening)]
+    if not opening.size:
+        return []
+    problem = range_problem(robot, (float(opening.min()), float(opening.max())))
+    return [f"{problem}; write the range into the calibration: --closed, --open"] * bool(problem)
 
 
 def _calibrated(source: Source, episode: str) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 from palm_jax import __version__
 from palm_jax.align import AlignSpec
 from palm_jax.train.data import aligning, motion, output
-from palm_jax.train.data.check import check_orientation
+from palm_jax.train.data.check import check_fit, reprojection
 from palm_jax.train.data.errors import DataError, OutputError
 from palm_jax.train.data.lerobot_writer import ENCODINGS, LeRobotWriter
 from palm_jax.train.data.output import Writer
@@ -81,15 +81,16 @@ def preflight(recording: Recording, *, least: float = LEAST_IN_VIEW, trust: bool
     Args:
       recording: the data with its calibration.
       least: share of frames that must show the TCP.
-      trust: do not look at the images.
+      trust: do not look at the images, at measured pixels, nor at the gripper's range.
 
     Raises:
-      DataError: see `Recording.trajectory`, `check_view`, `check_orientation`.
+      DataError: see `Recording.trajectory`, `check_view`, `Recording.check_opening`, `check_fit`.
     """
     survey = recording.survey()
     check_view(recording, survey, least=least)
     if not trust:
-        check_orientation(recording, motion.examine(recording))
+        recording.check_opening(survey)
+        check_fit(recording, motion.examine(recording), reprojection(recording))
     return survey
 
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from palm_jax.train import pictures
-from palm_jax.train.data import video
+from palm_jax.train.data import headers, video
 from palm_jax.train.data.errors import FormatError, KeyMissingError, TruncatedError
-from palm_jax.train.data.source import Feature, Source, checked_fps
+from palm_jax.train.data.source import Feature, Source
 
 CODEBASE = "v3.0"
 
@@ -41,11 +41,11 @@ class LeRobotSource(Source):
                 f"{path}: expected a LeRobot data set of version {CODEBASE}, got {version}; "
                 "convert it with lerobot's own converter"
             )
-        self.fps = checked_fps(self.info.get("fps"), path)
-        self._check_names()
+        headers.lerobot_info(self.info, str(path / "meta" / "info.json"))
+        self.fps = float(self.info["fps"])
         self._rows = self._episode_rows()
         self.episodes = tuple(self._rows)
-        self._features = self._described()
+        self._features = {key: _feature(key, entry) for key, entry in self.info["features"].items()}
         self._tasks = self._task_names()
 
     def _json(self, name: str) -> dict[str, Any]:
@@ -53,34 +53,7 @@ class LeRobotSource(Source):
             content = json.loads((self.path / name).read_text())
         except (OSError, ValueError, RecursionError) as error:
             raise FormatError(f"{self.path / name}: not readable ({error})") from error
-        if not isinstance(content, dict):
-            raise FormatError(f"{self.path / name}: expected a JSON object")
-        return content
-
-    def _check_names(self) -> None:
-        """Raises FormatError for patterns of file names that are none."""
-        for name, given in (("data_path", {}), ("video_path", {"video_key": "key"})):
-            pattern = self.info.get(name)
-            if pattern is None and name == "video_path":
-                continue  # a data set without videos
-            try:
-                if not isinstance(pattern, str):
-                    raise TypeError("no text")
-                pattern.format(chunk_index=0, file_index=0, **given)
-            except (TypeError, ValueError, LookupError, AttributeError) as error:
-                raise FormatError(
-                    f"{self.path}/meta/info.json: {name}: expected the pattern of a file's name "
-                    f"with chunk_index and file_index, got {pattern!r:.80} ({error})"
-                ) from error
-
-    def _described(self) -> dict[str, Feature]:
-        try:
-            return {key: _feature(key, entry) for key, entry in self.info["features"].items()}
-        except (AttributeError, LookupError, TypeError, ValueError, OverflowError) as error:
-            raise FormatError(
-                f"{self.path}/meta/info.json: features: expected dtype and shape of every key "
-                f"({type(error).__name__}: {error})"
-            ) from error
+        return headers.an_object(content, str(self.path / name))
 
     def _table(self, path: Path, columns: list[str] | None = None, **options: Any) -> Any:
         return self._whole(path, self._pq.read_table, columns=columns, **options)
@@ -106,6 +79,9 @@ class LeRobotSource(Source):
         for file in files:
             wanted = [name for name in self._names(file) if not name.startswith("stats/")]
             rows += self._table(file, wanted).to_pylist()
+        features = self.info["features"].items()
+        videos = [key for key, entry in features if entry["dtype"] == "video"]
+        headers.lerobot_rows(rows, videos, str(self.path / "meta" / "episodes"))
         rows.sort(key=lambda row: row["episode_index"])
         return {str(row["episode_index"]): row for row in rows}
 
@@ -158,15 +134,15 @@ class LeRobotSource(Source):
         column = self.column(episode, key)
         shape = self._features[key].shape
         try:
-            values = np.asarray(column.to_pylist()).reshape(self.length(episode), *shape)
+            values = np.asarray(column.to_pylist())
+            if values.dtype.kind in "biuf":
+                return values.reshape(len(values), *shape)
         except ValueError as error:
             raise FormatError(
-                f"{self.path}: {key!r}: expected {shape} numbers a frame, as meta/info.json says "
-                f"({error})"
+                f"{self.path}: {key}: expected {' x '.join(map(str, shape)) or 1} numbers a frame, "
+                f"as meta/info.json says, got others in episode {episode} ({error})"
             ) from error
-        if values.dtype.kind not in "biuf":
-            raise KeyMissingError(f"{self.path}: {key!r} holds no numbers")
-        return values
+        raise KeyMissingError(f"{self.path}: {key!r} holds no numbers")
 
     def blocks(self, episode: str, key: str, size: int) -> Iterator[np.ndarray]:
         count = self.length(episode)
@@ -185,8 +161,6 @@ class LeRobotSource(Source):
     def video(self, episode: str, key: str) -> tuple[Path, float]:
         """The video file of an episode, and where in it the episode begins (seconds)."""
         row = self._rows[episode]
-        if f"videos/{key}/chunk_index" not in row or self.info.get("video_path") is None:
-            raise KeyMissingError(f"{self.path}: meta/episodes has no video of {key!r}")
         name = self.info["video_path"].format(
             video_key=key,
             chunk_index=row[f"videos/{key}/chunk_index"],
@@ -197,9 +171,7 @@ class LeRobotSource(Source):
             raise TruncatedError(f"{file}: missing; copy the data set again")
         return file, float(row[f"videos/{key}/from_timestamp"])
 
-    def _decoded(self, item: Any) -> np.ndarray:
-        if not isinstance(item, dict):
-            raise KeyMissingError(f"{self.path}: a column of images holds none")
+    def _decoded(self, item: dict[str, Any]) -> np.ndarray:
         content = item.get("bytes")
         source: Any = io.BytesIO(content) if content else self.path / str(item.get("path"))
         try:
@@ -218,6 +190,22 @@ class LeRobotSource(Source):
         names = self._rows[episode].get("tasks") or list(self._tasks.values())
         return str(names[0]) if names else "unknown"
 
+    def _repaired(self, entry: str) -> dict[str, Any]:
+        """What `data repair` has noted; empty in other sets."""
+        try:
+            return dict(self._json("meta/palm.json")[entry])
+        except (FormatError, ValueError, TypeError, LookupError):
+            return {}
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        return frozenset(self._repaired("dropped"))
+
+    @property
+    def numbered_anew(self) -> dict[str, str]:
+        numbers = self._repaired("episodes")
+        return {old: str(new) for old, new in numbers.items() if old != new}
+
     def close(self) -> None:
         pass
 
@@ -230,7 +218,7 @@ def _feature(key: str, entry: dict[str, Any]) -> Feature:
     if dtype not in ("video", "image") or depth or len(shape) != 3:
         return Feature(() if shape == (1,) else shape, dtype)
     names = entry.get("names") or []
-    first = names[0] if isinstance(names, list) and names else ""
+    first = str(names[0]) if isinstance(names, list) and names else ""
     if first.startswith("channel") or (not first and shape[0] == 3):
         shape = (*shape[1:], shape[0])
     return Feature(shape, "uint8", images=shape[-1] == 3)

@@ -16,9 +16,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from palm_jax.align import Camera, distort_points
 from palm_jax.train.data.aligning import BLOCK
-from palm_jax.train.data.calibration import AXES, FLIPS, CameraCalibration, turned
-from palm_jax.train.data.importers import inverted
+from palm_jax.train.data.calibration import AXES, FLIPS, CameraCalibration, as_opencv, turned
 from palm_jax.train.data.recording import Recording, inside, projected
 from palm_jax.train.data.rotations import about
 
@@ -35,6 +35,9 @@ SURE = 3.0
 CLEARLY = 1.3
 """Factor by which its correlation must be larger."""
 
+ALIKE = 0.9
+"""Correlations from this share of the best on are taken for as good."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Reading:
@@ -46,9 +49,9 @@ class Reading:
     euler: str | None = None  # the three angles of the pose read in the other order
 
     @property
-    def changes(self) -> int:
-        """How much is taken to be wrong, apart from the flip."""
-        return (self.axes != "opencv") + self.inverse + (self.euler is not None)
+    def guessed(self) -> tuple[bool, int]:
+        """How much is taken to be wrong, apart from the flip; angles weigh most."""
+        return self.euler is not None, (self.axes != "opencv") + self.inverse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +76,8 @@ class Motion:
     @property
     def best(self) -> Finding:
         """The best reading, the given one included."""
-        return max((self.as_is, *self.others), key=lambda finding: finding.score)
+        first = self.others[:1]
+        return max((self.as_is, *first), key=lambda finding: finding.score)
 
     @property
     def wrong(self) -> bool:
@@ -97,7 +101,14 @@ def pose_as(pose: np.ndarray, reading: Reading) -> np.ndarray:
     if reading.euler is not None:
         pose = pose.copy()
         pose[:3, :3] = _reread(pose[:3, :3], reading.euler)
-    return (inverted(pose) if reading.inverse else pose) @ AXES[reading.axes]
+    return as_opencv(pose, reading.axes, reading.inverse)
+
+
+def camera_as(camera: CameraCalibration, episode: str, reading: Reading) -> Camera:
+    """The pinhole camera of an episode, its pose read in another way."""
+    plain = camera.camera(episode)
+    pose = pose_as(np.asarray(plain.cam_to_world, np.float64), reading)
+    return dataclasses.replace(plain, cam_to_world=pose.astype(np.float32))
 
 
 def _reread(rotation: np.ndarray, order: str) -> np.ndarray:
@@ -127,6 +138,27 @@ def stored_uv(flip: str, uv: np.ndarray, width: int, height: int) -> np.ndarray:
         "ccw": (height - v, u),
     }
     return np.stack(places[flip], -1)
+
+
+def seen_uv(camera: CameraCalibration, uv: np.ndarray, flip: str) -> np.ndarray:
+    """Where points are in the images as stored, lens and all.
+
+    Args:
+      camera: that took them.
+      uv: [..., 2] pixels at which a pinhole camera would show them, upright.
+      flip: what turns the stored images upright.
+
+    Returns:
+      [..., 2]; NaN for points that the lens puts nowhere near the image.
+    """
+    if camera.dist is not None:
+        size = np.array([camera.width, camera.height])
+        with np.errstate(invalid="ignore"):
+            # Further out the lens model may fold back into the image.
+            near = (np.abs(uv - size / 2) < size).all(-1, keepdims=True)
+        seen = distort_points(np.where(near, uv, np.nan), camera.K, camera.dist)
+        uv = np.asarray(seen, np.float64)
+    return stored_uv(flip, uv, camera.width, camera.height)
 
 
 def readings(camera: CameraCalibration) -> list[Reading]:
@@ -167,12 +199,18 @@ def examine(recording: Recording) -> Motion:
 
 
 def _grouped(found: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Best first; readings that give the same pixels together, the simplest in front."""
-    order = sorted(found, key=lambda f: (-round(f.score, 6), f.reading.changes))
+    """Best first; readings that give the same pixels together, the simplest in front.
+
+    Angles read in another order are a guess: where the pose need not have been made of angles at
+    all, a reading without them that fits about as well goes first.
+    """
+    order = sorted(found, key=lambda f: (-round(f.score, 6), f.reading.guessed))
     groups = []
     for _, members in itertools.groupby(order, key=lambda f: round(f.score, 6)):
         first, *rest = members
         groups.append(dataclasses.replace(first, same=tuple(f.reading for f in rest)))
+    alike = ALIKE * groups[0].score if groups else 0.0
+    groups.sort(key=lambda f: (f.score < alike, f.score >= alike and f.reading.euler is not None))
     return tuple(groups)
 
 
@@ -181,20 +219,13 @@ def _contributions(
 ) -> tuple[np.ndarray, float]:
     """[P] whose mean is the correlation, and the share of points in the image."""
     width, height = turned(reading.flip, camera.width, camera.height)
-    cells = np.empty((len(pairs.episodes), 2, 2))
+    uv = np.empty((len(pairs.episodes), 2, 2))
     visible = 0
-    cameras = {
-        episode: dataclasses.replace(
-            camera.camera(),
-            cam_to_world=pose_as(np.asarray(camera.camera(episode).cam_to_world, float), reading),
-        )
-        for episode in set(pairs.episodes)
-    }
+    cameras = {episode: camera_as(camera, episode, reading) for episode in set(pairs.episodes)}
     for index, (episode, points) in enumerate(zip(pairs.episodes, pairs.points, strict=True)):
-        uv, _ = projected(cameras[episode], points)
-        visible += int(inside(cameras[episode], uv).sum())
-        stored = stored_uv(reading.flip, uv, camera.width, camera.height)
-        cells[index] = stored * [_GRID / width, _GRID / height]
+        uv[index], _ = projected(cameras[episode], points)
+        visible += int(inside(cameras[episode], uv[index]).sum())
+    cells = seen_uv(camera, uv, reading.flip) * [_GRID / width, _GRID / height]
     grid = np.arange(_GRID) + 0.5
     # A spot is the product of a row and a column; one that is not seen is nothing.
     spots = np.exp(-((grid - cells[..., None]) ** 2) / (2 * _WIDTH**2))

@@ -34,6 +34,15 @@ def check_free(path: Path, source: Path) -> None:
     """
     if path.exists():
         raise OutputError(f"{path} exists and is not overwritten: move it, or choose another --out")
+    check_outside(path, source)
+
+
+def check_outside(path: Path, source: Path) -> None:
+    """Raises where an output would lie in the source's folder.
+
+    Raises:
+      OutputError.
+    """
     if source.resolve() in path.resolve().parents:
         raise OutputError(f"{path} lies inside the source {source}, which is never touched")
 

@@ -6,7 +6,7 @@ Nothing here reads images; a whole file is surveyed in seconds before the first 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -16,8 +16,10 @@ from palm_jax._checks import PoseError, check_pose
 from palm_jax.align import Camera
 from palm_jax.train.data import calibration as calib
 from palm_jax.train.data import rotations
-from palm_jax.train.data.calibration import Calibration, RobotKeys
+from palm_jax.train.data.calibration import Calibration, CameraCalibration, RobotKeys
 from palm_jax.train.data.errors import (
+    CalibrationError,
+    DataError,
     EpisodeLengthError,
     EulerAmbiguityError,
     FormatError,
@@ -47,6 +49,13 @@ KNOWN_OPENINGS = {
 LEAST_IN_VIEW = 0.75
 """Share of frames that must show the TCP, unless told otherwise."""
 
+OUTSIDE = 0.25
+"""How far beyond closed and open a gripper's values may be, as a share of the range between."""
+
+STILL, HELD = 0.05, 0.2
+"""A gripper that is never further open, as a share of that range, is closed throughout; one that
+varies by less, as a share of its opening, holds something throughout."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Trajectory:
@@ -54,6 +63,7 @@ class Trajectory:
 
     tcp: np.ndarray  # [T, 4, 4] float64, base
     opening: np.ndarray  # [T] float64, 0 closed to 1 open
+    reach: tuple[float, float]  # least and most of the opening before it was limited to 0..1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,9 +74,15 @@ class Survey:
     frames: int
     in_view: float  # share of frames with the TCP in front of the camera, inside the image
     behind: float  # share with the TCP behind the camera
-    uv: tuple[np.ndarray, ...]  # one [T, 2] an episode, pixels; NaN behind the camera
     worst: str  # the episode with the smallest share in view
     worst_share: float
+    opening: tuple[float, float]  # least and most of the gripper, 0 closed to 1 open, not clipped
+
+
+def gripper_values(numbers: np.ndarray) -> np.ndarray:
+    """[T] one number a frame of a gripper's columns [T, n]: itself, or the mean absolute value of
+    several fingers, which move with opposite signs."""
+    return numbers[:, 0] if numbers.shape[1] == 1 else np.abs(numbers).mean(1)
 
 
 def projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -100,6 +116,7 @@ class Recording:
 
     Raises:
       CameraNameError, ImageSizeError: see `Calibration.find`, `CameraCalibration.upright`.
+      CalibrationError: the camera has poses of episodes that are not in the data.
       KeyMissingError, EulerAmbiguityError, OpeningError: the robot's keys are unknown.
     """
 
@@ -108,6 +125,7 @@ class Recording:
         self.camera, self.image_key = calibration.find(camera, source.image_keys)
         height, width, _ = source.features()[self.image_key].shape
         self.camera.upright(np.empty((0, height, width, 3), np.uint8))
+        _check_episodes(source, self.camera)
         self.keys = robot_keys(source, calibration.robot)
 
     def __enter__(self) -> Self:
@@ -120,47 +138,19 @@ class Recording:
         """The robot's path in an episode.
 
         Raises:
-          EpisodeLengthError: fewer than two frames, or arrays of different lengths.
-          PoseDataError: poses that are not finite or not rigid, a gripper that is not finite.
-          FormatError: see `rotations.poses`.
+          EpisodeLengthError, PoseDataError, FormatError: see `trajectory_of`.
+          DataError: see `Source.columns`.
         """
-        where = f"{self.source.path}: {episode}"
-        length = self.source.length(episode)
-        if length < 2:
-            raise EpisodeLengthError(
-                f"{where} has {length} frame{'s' * (length != 1)}; a motion needs two. Leave it "
-                f"out: `python -m palm_jax data repair {self.source.path} --out NEW`"
-            )
-        assert self.keys.pose and self.keys.rotation and self.keys.opening
-        numbers = self.source.columns(episode, self.keys.pose)
-        gripper = self.source.columns(episode, self.keys.opening)
-        for key, values in ((self.keys.pose, numbers), (self.keys.opening, gripper)):
-            if len(values) != length:
-                raise EpisodeLengthError(
-                    f"{where}: expected {length} rows in {key}, got {len(values)}; leave the "
-                    "episode out with `data repair`"
-                )
-        if not np.isfinite(gripper).all():
-            raise PoseDataError(f"{where}: {self.keys.opening} has NaN or infinity")
-        return Trajectory(self._tcp(numbers, where), self._opening(gripper))
-
-    def _tcp(self, numbers: np.ndarray, where: str) -> np.ndarray:
-        advice = "leave the episode out with `data repair`, or mend it where it was made"
-        assert self.keys.rotation is not None
+        numbers, gripper = robot_columns(self.source, episode, self.keys)
         try:
-            poses = rotations.poses(numbers, self.keys.rotation)
-        except (PoseDataError, FormatError) as error:
-            raise type(error)(f"{where}: {self.keys.pose}: {error}; {advice}") from error
-        try:
-            check_pose(poses, self.keys.pose or "")
-        except PoseError:
-            raise PoseDataError(f"{where}: {_first_problem(poses)}; {advice}") from None
-        return poses @ self.calibration.ee_to_tcp
-
-    def _opening(self, gripper: np.ndarray) -> np.ndarray:
-        closed, opened = self.keys.closed, self.keys.open
-        assert closed is not None and opened is not None
-        return np.clip((np.abs(gripper).mean(1) - closed) / (opened - closed), 0.0, 1.0)
+            hand = trajectory_of(self.keys, numbers, gripper, self.source.length(episode))
+        except (EpisodeLengthError, PoseDataError, FormatError) as error:
+            raise type(error)(
+                f"{self.source.path}: {episode}: {error}; leave the episode out: `python -m "
+                f"palm_jax data repair {self.source.path} --calibration C --out NEW`, or mend it "
+                "where it was made"
+            ) from error
+        return dataclasses.replace(hand, tcp=hand.tcp @ self.calibration.ee_to_tcp)
 
     def survey(self, episodes: Iterable[str] | None = None) -> Survey:
         """Reads every pose and tells where the TCP appears.
@@ -169,21 +159,133 @@ class Recording:
           EpisodeLengthError, PoseDataError: see `trajectory`.
         """
         names = list(self.source.episodes if episodes is None else episodes)
-        uvs, shares = [], []
+        shares: list[float] = []
         behind = seen = frames = 0
+        reached: list[float] = []
         for name in names:
             camera = self.camera.camera(name)
-            uv, depth = projected(camera, self.trajectory(name).tcp[:, :3, 3])
+            hand = self.trajectory(name)
+            uv, depth = projected(camera, hand.tcp[:, :3, 3])
             visible = inside(camera, uv)
-            uvs.append(uv)
             shares.append(float(visible.mean()))
             behind += int((depth <= 1e-4).sum())
             seen, frames = seen + int(visible.sum()), frames + len(uv)
+            reached += hand.reach
         worst = int(np.argmin(shares))
         return Survey(
-            len(names), frames, seen / frames, behind / frames, tuple(uvs), names[worst],
-            shares[worst],
+            len(names), frames, seen / frames, behind / frames, names[worst], shares[worst],
+            (min(reached), max(reached)),
         )  # fmt: skip
+
+    def check_opening(self, survey: Survey) -> None:
+        """Raises where the gripper's values are not those between closed and open.
+
+        Raises:
+          OpeningError: see `range_problem`.
+        """
+        problem = range_problem(self.keys, survey.opening)
+        if problem:
+            raise OpeningError(
+                f"{self.source.path}: {problem}; change the calibration: `data calibrate --from "
+                "palm --file C --closed VALUE --open VALUE --out NEW` (--trust if you know better)"
+            )
+
+
+def robot_columns(source: Source, episode: str, keys: RobotKeys) -> tuple[np.ndarray, np.ndarray]:
+    """Pose [T, n] and gripper [T, m] of an episode, as the file has them.
+
+    Raises:
+      DataError: see `Source.columns`.
+    """
+    assert keys.pose and keys.opening
+    return source.columns(episode, keys.pose), source.columns(episode, keys.opening)
+
+
+def trajectory_of(
+    keys: RobotKeys, numbers: np.ndarray, gripper: np.ndarray, length: int
+) -> Trajectory:
+    """The hand's path out of what a file has.
+
+    Args:
+      keys: nothing left open.
+      numbers, gripper: see `robot_columns`.
+      length: frames that the episode should have.
+
+    Raises:
+      EpisodeLengthError: fewer than two frames, or arrays of another length.
+      PoseDataError: poses that are not finite or not rigid, a gripper that is not finite.
+      FormatError: see `rotations.poses`.
+    """
+    assert keys.pose and keys.rotation and keys.opening
+    if length < 2:
+        raise EpisodeLengthError(f"expected at least two frames, a motion, got {length}")
+    for key, values in ((keys.pose, numbers), (keys.opening, gripper)):
+        if len(values) != length:
+            raise EpisodeLengthError(f"expected {length} rows in {key}, got {len(values)}")
+    try:
+        poses = rotations.poses(numbers, keys.rotation)
+    except (PoseDataError, FormatError) as error:
+        raise type(error)(f"{keys.pose}: {error}") from error
+    try:
+        check_pose(poses, keys.pose)
+    except PoseError:
+        raise PoseDataError(f"{keys.pose}: {_first_problem(poses)}") from None
+    if not np.isfinite(gripper).all():
+        raise PoseDataError(f"{keys.opening} has NaN or infinity")
+    opening = openness(keys, gripper)
+    reach = float(opening.min()), float(opening.max())
+    return Trajectory(poses, np.clip(opening, 0.0, 1.0), reach)
+
+
+def openness(keys: RobotKeys, gripper: np.ndarray) -> np.ndarray:
+    """[T] of the gripper's columns [T, m]: 0 where it is as when closed, 1 as when open."""
+    assert keys.closed is not None and keys.open is not None
+    return (gripper_values(gripper) - keys.closed) / (keys.open - keys.closed)
+
+
+def range_problem(keys: RobotKeys, reach: tuple[float, float]) -> str:
+    """Why values of the gripper do not fit the range from closed to open, or an empty string.
+
+    Args:
+      keys: nothing left open.
+      reach: see `Trajectory`.
+    """
+    assert keys.closed is not None and keys.open is not None
+    low, high = reach
+    values = sorted(keys.closed + share * (keys.open - keys.closed) for share in reach)
+    found = (
+        f"{keys.opening} goes from {values[0]:.4g} to {values[1]:.4g}, with {keys.closed:g} for "
+        f"closed and {keys.open:g} for open"
+    )
+    if low < -OUTSIDE or high > 1 + OUTSIDE:
+        return f"{found}: far outside, all of it would count as closed or open"
+    if STILL < high < 0.5 and high - low > HELD * high:
+        return f"{found}: it moves, but is never half open, and would never count as open"
+    return ""
+
+
+def _check_episodes(source: Source, camera: CameraCalibration) -> None:
+    """Raises where a camera has poses of episodes that a file neither has nor had."""
+    known = {*source.episodes, *source.left_out}
+    lacking = [name for name in camera.by_episode if name not in known]
+    if not lacking:
+        return
+    anew = source.numbered_anew
+    advice = f"rename them; the file has {_some(source.episodes)}"
+    if anew:
+        moved = _some([f"{old} is now {new}" for old, new in anew.items()])
+        advice = (
+            f"`data repair` has numbered the episodes anew ({moved}): give it the --calibration, "
+            "and it writes one for the new file"
+        )
+    raise CalibrationError(
+        f"cameras.{camera.name}.by_episode: expected names of episodes in {source.path}, got "
+        f"{_some(lacking)}, whose poses would be left unused: {advice}"
+    )
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def _first_problem(poses: np.ndarray) -> str:
@@ -277,9 +379,24 @@ def _known(source: Source, names: Iterable[str]) -> str | None:
     return None
 
 
+def _sample(source: Source, expression: str) -> np.ndarray:
+    """The columns in the first episode that can be read: a damaged one is named where it is used.
+
+    Raises:
+      DataError: none can.
+    """
+    problems = []
+    for name in source.episodes:
+        try:
+            return source.columns(name, expression)
+        except DataError as error:
+            problems.append(error)
+    raise problems[0]
+
+
 def _rotation(source: Source, pose: str) -> str:
     """How to read a pose by its number of columns alone, where that settles it."""
-    numbers = source.columns(source.episodes[0], pose)
+    numbers = _sample(source, pose)
     count = numbers.shape[1]
     if count in (9, 16):
         return "rot6d" if count == 9 else "matrix"
@@ -319,17 +436,18 @@ def _gripper(source: Source, given: RobotKeys) -> tuple[str, float, float]:
             f"{source.path}: which key is the gripper? None is known by name. Write it into the "
             "calibration: `data calibrate ... --opening KEY --closed VALUE --open VALUE`"
         )
-    columns = source.columns(source.episodes[0], opening)
+    columns = _sample(source, opening)
     count, closed, opened = KNOWN_OPENINGS.get(opening, (0, None, None))
     closed = given.closed if given.closed is not None else closed
     opened = given.open if given.open is not None else opened
     told = given.closed is not None and given.open is not None
     if closed is None or opened is None or (columns.shape[1] != count and not told):
-        size = np.abs(columns).mean(1)
+        size = gripper_values(columns)
+        several = f"Its {columns.shape[1]} columns have a mean absolute value"
         raise OpeningError(
-            f"{source.path}: what is {opening} when the gripper is closed, and what when open? Its "
-            f"{columns.shape[1]} columns have a mean absolute value from {size.min():.4g} to "
-            f"{size.max():.4g} in the first episode. Write it into the calibration: "
+            f"{source.path}: what is {opening} when the gripper is closed, and what when open? "
+            f"{several if columns.shape[1] > 1 else 'It goes'} from {size.min():.4g} to "
+            f"{size.max():.4g} in an episode. Write it into the calibration: "
             "`data calibrate ... --opening KEY --closed VALUE --open VALUE`"
         )
     if closed == opened:

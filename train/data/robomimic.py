@@ -20,13 +20,17 @@ from typing import Any
 import h5py
 import numpy as np
 
+from palm_jax.train.data import headers
 from palm_jax.train.data.errors import FormatError, KeyMissingError, TruncatedError
-from palm_jax.train.data.source import Feature, Source, checked_fps
+from palm_jax.train.data.source import Feature, Source
 
 CACHE_BYTES = 64 * 2**20
 """For chunks that are larger than a block or cut frames into pieces."""
 
 DEFAULT_FPS = 20.0
+
+REPAIR = "palm_repair"
+"""Attribute of `data` in a file that `data repair` has written: what it left out, as JSON."""
 
 
 def _inflater() -> Any:
@@ -107,23 +111,16 @@ class RobomimicSource(Source):
         if not names:
             raise FormatError(f"{self.path}: no episode in 'data'")
         self.episodes = tuple(sorted(names, key=by_number))
-        self.env_args = self._json(data.attrs.get("env_args", "{}"), "env_args")
-        kwargs = self.env_args.get("env_kwargs") or {}
-        if not isinstance(kwargs, dict):
-            raise FormatError(f"{self.path}: env_args: expected an object as env_kwargs")
-        fps = kwargs.get("control_freq") or data.attrs.get("fps", DEFAULT_FPS)
-        self.fps = checked_fps(fps, self.path)
+        self.env_args = headers.parsed(data.attrs.get("env_args", "{}"), f"{self.path}: env_args")
+        self.fps = self._rate()
         self._features = {key: _feature(dataset) for key, dataset in self.datasets(names[0])}
 
-    def _json(self, text: Any, name: str) -> dict[str, Any]:
-        """The object in an attribute."""
-        try:
-            found = json.loads(text)
-        except (TypeError, ValueError, RecursionError) as error:
-            raise FormatError(f"{self.path}: the attribute {name} is no JSON ({error})") from error
-        if not isinstance(found, dict):
-            raise FormatError(f"{self.path}: the attribute {name}: expected a JSON object")
-        return found
+    def _rate(self) -> float:
+        where = f"{self.path}: env_args: env_kwargs"
+        told = headers.an_object(self.env_args.get("env_kwargs") or {}, where).get("control_freq")
+        if told is not None:
+            return headers.rate(told, f"{where}: control_freq")
+        return headers.rate(self.data.attrs.get("fps", DEFAULT_FPS), f"{self.path}: fps")
 
     def _is_episode(self, name: str) -> bool:
         try:
@@ -160,21 +157,28 @@ class RobomimicSource(Source):
         return found
 
     def _dataset(self, episode: str, key: str) -> h5py.Dataset:
-        found = self.demo(episode).get(key)
-        if not isinstance(found, h5py.Dataset):
+        try:
+            dataset = self.demo(episode)[key]
+        except KeyError:
             raise KeyMissingError(
                 f"{self.path}: {episode} has no {key!r}, which the first episode has; leave the "
                 "episode out with `data repair`"
+            ) from None
+        if not isinstance(dataset, h5py.Dataset) or not dataset.shape:
+            raise FormatError(
+                f"{self.path}: {episode}: {key}: expected an array with a row for each frame, got "
+                f"{'a group' if isinstance(dataset, h5py.Group) else 'a single value'}; leave the "
+                "episode out with `data repair`"
             )
-        return found
+        return dataset
 
     def length(self, episode: str) -> int:
         demo = self.demo(episode)
-        actions, count = demo.get("actions"), demo.attrs.get("num_samples")
-        if isinstance(actions, h5py.Dataset) and actions.shape:
-            return len(actions)
-        if isinstance(count, int | np.integer):
-            return int(count)
+        if "actions" in demo:
+            return len(self._dataset(episode, "actions"))
+        if "num_samples" in demo.attrs:
+            where = f"{self.path}: {episode}: num_samples"
+            return headers.count(demo.attrs["num_samples"], where)
         return max((len(dataset) for _, dataset in self.datasets(episode)), default=0)
 
     def features(self) -> dict[str, Feature]:
@@ -187,7 +191,7 @@ class RobomimicSource(Source):
     def _read(self, dataset: h5py.Dataset, rows: Any) -> np.ndarray:
         try:
             values: np.ndarray = dataset[rows]
-        except (OSError, RuntimeError, ValueError, IndexError) as error:
+        except (OSError, RuntimeError) as error:
             raise TruncatedError(
                 f"{self.path}: {dataset.name} cannot be read ({error}); save the whole episodes: "
                 f"`python -m palm_jax data repair {self.path} --out NEW`"
@@ -266,7 +270,7 @@ class RobomimicSource(Source):
 
     def camera_info(self, episode: str) -> dict[str, dict[str, Any]]:
         text = self.demo(episode).attrs.get("camera_info")
-        return {} if text is None else self._json(text, f"camera_info of {episode}")
+        return headers.camera_info(text, f"{self.path}: {episode}: camera_info") if text else {}
 
     def model_file(self, episode: str) -> str | None:
         text = self.demo(episode).attrs.get("model_file")
@@ -293,6 +297,13 @@ class RobomimicSource(Source):
             )
         train, valid = ([name for name in self.episodes if name in names] for names in named)
         return (train, valid) if train and valid else None
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        try:
+            return frozenset(json.loads(self.data.attrs.get(REPAIR, "{}"))["dropped"])
+        except (ValueError, TypeError, LookupError):
+            return frozenset()
 
     def close(self) -> None:
         if self._pool is not None:

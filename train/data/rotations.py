@@ -132,6 +132,16 @@ def poses(numbers: np.ndarray, reading: str) -> np.ndarray:
     return result
 
 
+def inverted(pose: np.ndarray) -> np.ndarray:
+    """The inverse of rigid poses [..., 4, 4]."""
+    rotation = np.swapaxes(pose[..., :3, :3], -1, -2)
+    result = np.zeros_like(pose)
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = -(rotation @ pose[..., :3, 3:])[..., 0]
+    result[..., 3, 3] = 1.0
+    return result
+
+
 def apart(first: np.ndarray, second: np.ndarray) -> float:
     """The largest angle in degrees between rotations [..., 3, 3]."""
     trace = np.einsum("...ij,...ij->...", first, second)

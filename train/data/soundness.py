@@ -24,8 +24,8 @@ from palm_jax.train.data.errors import (
 )
 from palm_jax.train.data.lerobot import LeRobotSource
 from palm_jax.train.data.lerobot_writer import LeRobotWriter
-from palm_jax.train.data.recording import robot_keys
-from palm_jax.train.data.robomimic import RobomimicSource, by_number
+from palm_jax.train.data.recording import robot_columns, robot_keys, trajectory_of
+from palm_jax.train.data.robomimic import REPAIR, RobomimicSource
 from palm_jax.train.data.source import Source, fingerprint, open_source
 
 Problems = dict[str, list[str]]  # episode, or "" for the file -> what is wrong
@@ -37,19 +37,19 @@ _PER_FRAME = ("actions", "states", "rewards", "dones")
 def verify(path: Path, *, robot: RobotKeys | None = None) -> Problems:
     """Reads everything and reports what is wrong; empty if the file is sound.
 
-    Lengths, totals, finite poses and actions, images that can be decoded or counted, and the
-    checksums of what `data align` has written.
+    Lengths, totals, poses that `data align` would take, finite actions, images that can be decoded
+    or counted, and the checksums of what `data align` has written.
 
     Args:
       path: file or folder.
-      robot: keys of the pose and the gripper, where they are not known ones.
+      robot: keys of the pose and the gripper, where they are not known ones; see `unread`.
 
     Raises:
       FormatError, TruncatedError: the file cannot even be opened.
     """
     with open_source(path) as source:
         problems: Problems = {}
-        keys = _pose_keys(source, robot or RobotKeys())
+        keys = _known_keys(source, robot or RobotKeys())
         for name in source.episodes:
             found = _episode(source, name, keys)
             if found:
@@ -58,29 +58,36 @@ def verify(path: Path, *, robot: RobotKeys | None = None) -> Problems:
         return ({"": whole} if whole else {}) | problems
 
 
-def _pose_keys(source: Source, robot: RobotKeys) -> list[str]:
-    """Expressions whose numbers must be finite."""
+def unread(path: Path, *, robot: RobotKeys | None = None) -> str:
+    """Why the poses of a file are not looked at, or an empty string.
+
+    Args:
+      path, robot: see `verify`.
+    """
+    with _opened(path) as source:
+        try:
+            robot_keys(source, robot or RobotKeys())
+        except DataError as error:
+            return str(error).removeprefix(f"{path}: ")
+    return ""
+
+
+def _known_keys(source: Source, robot: RobotKeys) -> RobotKeys | None:
+    """Where the robot's poses are, if that is known."""
     try:
-        keys = robot_keys(source, robot)
+        return robot_keys(source, robot)
     except DataError:
-        return []
-    return [key for key in (keys.pose, keys.opening) if key]
+        return None
 
 
-def _episode(source: Source, name: str, keys: list[str]) -> list[str]:
+def _episode(source: Source, name: str, keys: RobotKeys | None) -> list[str]:
     problems: list[str] = []
     try:
         length = source.length(name)
-        if length < 2:
-            problems.append(f"{length} frame{'s' * (length != 1)}")
-        actions = [key for key in source.number_keys if key in ("actions", "action")]
-        for key in [*keys, *actions]:
-            values = source.columns(name, key)
-            if len(values) != length:
-                problems.append(f"{key} has {len(values)} rows, expected {length}")
-            bad = np.flatnonzero(~np.isfinite(values).all(1))
-            if len(bad):
-                problems.append(f"{key} has NaN or infinity in {len(bad)} frames from {bad[0]} on")
+        problems += _robot(source, name, keys, length)
+        for key in source.number_keys:
+            if key in ("actions", "action"):
+                problems += _finite_rows(key, source.columns(name, key), length)
         for key in source.image_keys:
             count = _count(source, name, key)
             if count != length:
@@ -90,6 +97,24 @@ def _episode(source: Source, name: str, keys: list[str]) -> list[str]:
     except (DataError, OSError, RuntimeError, KeyError, ValueError) as error:
         problems.append(str(error).removeprefix(f"{source.path}: "))
     return problems
+
+
+def _robot(source: Source, name: str, keys: RobotKeys | None, length: int) -> list[str]:
+    """What `Recording.trajectory` would refuse."""
+    if keys is None or length < 2:
+        return [f"{length} frame{'s' * (length != 1)}"] if length < 2 else []
+    try:
+        trajectory_of(keys, *robot_columns(source, name, keys), length)
+    except DataError as error:
+        return [str(error).removeprefix(f"{source.path}: ")]
+    return []
+
+
+def _finite_rows(key: str, values: np.ndarray, length: int) -> list[str]:
+    if len(values) != length:
+        return [f"{key} has {len(values)} rows, expected {length}"]
+    bad = np.flatnonzero(~np.isfinite(values).all(1))
+    return [f"{key} has NaN or infinity in {len(bad)} frames from {bad[0]} on"] if len(bad) else []
 
 
 def _count(source: Source, name: str, key: str) -> int:
@@ -117,10 +142,13 @@ def _hdf5_episode(source: RobomimicSource, name: str, length: int) -> list[str]:
 
 
 def _totals(source: Source) -> list[str]:
-    frames = sum(source.length(name) for name in source.episodes)
+    try:
+        frames = sum(source.length(name) for name in source.episodes)
+    except DataError:
+        return []  # the episode is reported by itself
     if isinstance(source, RobomimicSource):
         total = source.data.attrs.get("total")
-        return [] if total is None or int(total) == frames else [f"total is {total}, not {frames}"]
+        return [] if total is None or total == frames else [f"total is {total}, not {frames}"]
     problems = []
     if isinstance(source, LeRobotSource):
         expected = {"total_episodes": len(source.episodes), "total_frames": frames}
@@ -146,13 +174,15 @@ class Repair:
     path: Path
     kept: tuple[str, ...]
     dropped: Mapping[str, str]  # episode -> why
+    numbers: Mapping[str, str]  # kept episode -> its name in the new file
 
 
 def repair(path: Path, out: Path, *, robot: RobotKeys | None = None) -> Repair:
-    """Copies the sound episodes of a file into a new one, numbered anew, with totals that are
-    right.
+    """Copies the sound episodes of a file into a new one, with totals that are right.
 
-    Works on HDF5 files that end too early: what lies beyond the end is not taken for zeros.
+    Works on HDF5 files that end too early: what lies beyond the end is not taken for zeros. Their
+    episodes keep their names, which a calibration may know; LeRobot demands numbers without gaps,
+    so those of a folder are numbered anew, and meta/palm.json says how.
 
     Args:
       path: file or folder; never touched.
@@ -179,7 +209,8 @@ def repair(path: Path, out: Path, *, robot: RobotKeys | None = None) -> Repair:
                 if not kept:
                     reasons = "; ".join(f"{n}: {r[0]}" for n, r in list(problems.items())[:3])
                     raise OutputError(f"{path}: no sound episode to save ({reasons})")
-                note = {"repaired": fingerprint(path, source.files()), "dropped": problems}
+                numbers = _numbers(source, kept)
+                note = _note(source, problems, numbers)
                 if isinstance(source, RobomimicSource):
                     _copy_hdf5(source, kept, partial, note)
                     output.publish(partial, out)
@@ -188,7 +219,24 @@ def repair(path: Path, out: Path, *, robot: RobotKeys | None = None) -> Repair:
         except BaseException:
             output.remove(partial)
             raise
-    return Repair(out, tuple(kept), {name: reasons[0] for name, reasons in problems.items()})
+    dropped = {name: reasons[0] for name, reasons in problems.items()}
+    return Repair(out, tuple(kept), dropped, numbers)
+
+
+def _numbers(source: Source, kept: list[str]) -> dict[str, str]:
+    """What the kept episodes are called in the new file."""
+    if isinstance(source, LeRobotSource):
+        return {name: str(index) for index, name in enumerate(kept)}
+    return {name: name for name in kept}
+
+
+def _note(source: Source, problems: Problems, numbers: Mapping[str, str]) -> dict[str, Any]:
+    """What the new file says of its making."""
+    note = {"repaired": fingerprint(source.path, source.files()), "dropped": problems}
+    if isinstance(source, LeRobotSource):
+        return note | {"episodes": dict(numbers)}
+    # Episodes keep their names, so what an earlier repair left out is still what it was.
+    return note | {"dropped": dict.fromkeys(source.left_out, ["left out before"]) | problems}
 
 
 def _unsound(source: Source, name: str, robot: RobotKeys) -> list[str]:
@@ -196,7 +244,7 @@ def _unsound(source: Source, name: str, robot: RobotKeys) -> list[str]:
         lost = source.lost(name)
         if lost:
             return [f"{lost} lies beyond the end of the file"]
-    problems = _episode(source, name, _pose_keys(source, robot))
+    problems = _episode(source, name, _known_keys(source, robot))
     # What copying puts right is no reason to drop an episode.
     return [text for text in problems if not text.startswith("num_samples")]
 
@@ -306,23 +354,15 @@ def _copy_hdf5(
         data = file.create_group("data")
         for key, value in source.data.attrs.items():
             data.attrs[key] = value
-        data.attrs["palm_repair"] = json.dumps(note)
+        data.attrs[REPAIR] = json.dumps(note)
         data.attrs["total"] = sum(source.length(name) for name in kept)
-        numbers = {}
-        for index, name in enumerate(sorted(kept, key=by_number)):
-            numbers[name] = f"demo_{index}"
-            source.file.copy(source.data[name], data, name=numbers[name])
-            data[numbers[name]].attrs["num_samples"] = source.length(name)
+        for name in kept:
+            source.file.copy(source.data[name], data, name=name)
+            data[name].attrs["num_samples"] = source.length(name)
         try:
-            _renamed_masks(source.file, file, numbers)
+            robomimic_writer.copy_masks(source.file, file, kept)
         except (OSError, RuntimeError, KeyError):
             pass  # beyond the end: filter keys can be made again
-
-
-def _renamed_masks(old: h5py.File, new: h5py.File, numbers: Mapping[str, str]) -> None:
-    for key, item in (old.get("mask") or {}).items():
-        names = [numbers[n] for raw in item[()] if (n := raw.decode()) in numbers]
-        new[f"mask/{key}"] = np.array(names, dtype="S")
 
 
 def _copy_lerobot(source: Source, kept: list[str], out: Path, note: dict[str, Any]) -> None:

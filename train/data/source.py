@@ -9,9 +9,8 @@ from __future__ import annotations
 import abc
 import dataclasses
 import hashlib
-import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -90,6 +89,16 @@ class Source(abc.ABC):
         """What is done in the episode, in words."""
         return "unknown"
 
+    @property
+    def left_out(self) -> frozenset[str]:
+        """Names of episodes that `data repair` did not take over into this file."""
+        return frozenset()
+
+    @property
+    def numbered_anew(self) -> Mapping[str, str]:
+        """Episode before a `data repair` -> its name now, where that is another one."""
+        return {}
+
     def split(self) -> tuple[list[str], list[str]] | None:
         """Episodes for training and for validation, where the file itself says so."""
         return None
@@ -166,23 +175,6 @@ class Source(abc.ABC):
     def fingerprint(self) -> dict[str, Any]:
         """Identifies the content: name, bytes, and a hash whose name says of what."""
         return fingerprint(self.path, self.files())
-
-
-def checked_fps(value: Any, path: Path) -> float:
-    """Frames a second, as a file says.
-
-    Raises:
-      FormatError: not a positive number.
-    """
-    try:
-        fps = float(value)
-    except (TypeError, ValueError, OverflowError):
-        fps = math.nan
-    if not 0 < fps < math.inf:
-        raise FormatError(
-            f"{path}: expected a positive number of frames a second, got {value!r:.80}"
-        )
-    return fps
 
 
 def fingerprint(path: Path, files: list[Path]) -> dict[str, Any]:
