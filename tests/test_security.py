@@ -2,6 +2,7 @@
 
 import ast
 import html.parser
+import io
 import json
 import shutil
 import zipfile
@@ -9,13 +10,18 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import datasets
 import h5py
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 import pytest
-from PIL import Image
+from PIL import EpsImagePlugin, Image
 
 from palm_jax.train import checkpoint, demos, pictures, records, report, table_page, torch_files
 from palm_jax.train.checkpoint import DamagedCheckpoint
+from palm_jax.train.data.errors import TruncatedError
+from palm_jax.train.data.source import open_source
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = sorted(
@@ -57,6 +63,8 @@ def offences(source: str, allowed: set[str] = frozenset()) -> Iterator[str]:  # 
                 for name in names
                 if name and name.split(".")[0] in UNPICKLERS - allowed
             )
+            if isinstance(node, ast.ImportFrom) and node.module == "PIL.Image":
+                yield "from PIL.Image import ..."  # whose calls would have no name to look for
         if not isinstance(node, ast.Call):
             continue
         name = dotted(node.func)
@@ -68,6 +76,8 @@ def offences(source: str, allowed: set[str] = frozenset()) -> Iterator[str]:  # 
                 yield f"{name} without allow_pickle=False"
         if name.startswith("pickle.") and last in ("load", "loads"):
             yield f"{name}(...)"
+        if f".{name}".endswith(".Image.open") and option(node, "formats") is None:
+            yield f"{name} without formats="
         if option(node, "shell") == "True":
             yield f"{name} with shell=True"
 
@@ -83,14 +93,18 @@ def test_nothing_runs_what_a_file_says(path: Path) -> None:
     ["import pickle", "from pickle import loads", "import torch.nn", "eval('1')", "exec(text)",
      "np.load(path)", "np.load(path, allow_pickle=True)", "numpy.load(p, allow_pickle=flag)",
      "yaml.load(x)\nimport yaml", "archive.extractall()", "os.system(x)", "run(x, shell=True)",
-     "__import__(name)", "compile(text, 'f', 'exec')"],
+     "__import__(name)", "compile(text, 'f', 'exec')", "PIL.Image.open(path)", "Image.open(file)",
+     "from PIL.Image import open"],
 )  # fmt: skip
 def test_the_search_finds_them(source: str) -> None:
     assert list(offences(source))
 
 
 def test_the_search_lets_pass_what_is_safe() -> None:
-    safe = "re.compile(x)\nnp.load(p, allow_pickle=False)\njson.load(f)\nnp.save(p, x)"
+    safe = (
+        "re.compile(x)\nnp.load(p, allow_pickle=False)\njson.load(f)\nnp.save(p, x)\n"
+        "Image.open(p, formats=FORMATS)\nfile.open()"
+    )
     assert list(offences(safe)) == [] and len(SOURCES) > 60
     # The one that reads .pth files names what it knows, and calls no ready-made loader.
     assert list(offences((ROOT / "train/torch_files.py").read_text())) == ["import pickle"]
@@ -125,11 +139,55 @@ def test_an_archive_that_unpacks_to_more_is_refused(tmp_path: Path) -> None:
         torch_files.read_tensors(tmp_path / "a.pth")
 
 
-def test_pictures_are_of_the_kinds_that_they_say(tmp_path: Path) -> None:
+@pytest.fixture
+def ghostscript(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The calls of what would run a PostScript file, instead of running it."""
+    calls: list[str] = []
+
+    def called(*_: Any, **__: Any) -> Any:
+        calls.append("Ghostscript")
+        return Image.new("RGB", (4, 4)).im
+
+    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", called)
+    return calls
+
+
+def postscript() -> bytes:
+    content = io.BytesIO()
+    Image.new("RGB", (4, 4)).save(content, format="EPS")
+    return content.getvalue()
+
+
+def test_pictures_are_of_the_kinds_that_they_say(tmp_path: Path, ghostscript: list[str]) -> None:
     """A PostScript program is none, whatever its name."""
-    Image.new("RGB", (4, 4)).save(tmp_path / "a.png", format="EPS")
-    with pytest.raises(ValueError, match="a.png cannot be read as a picture"):
+    (tmp_path / "a.png").write_bytes(postscript())
+    with Image.open(tmp_path / "a.png") as picture:
+        picture.load()
+    assert ghostscript.pop() == "Ghostscript"  # Pillow by itself would run it
+    with pytest.raises(ValueError, match="a.png cannot be read as a picture: not a whole picture"):
         pictures.read_folder(tmp_path, 8)
+    assert ghostscript == []
+
+
+def test_images_in_a_table_are_of_known_kinds(tmp_path: Path, ghostscript: list[str]) -> None:
+    """Those of a LeRobot data set: PNG or JPEG inside as a rule, PostScript never."""
+    root = datasets.lerobot(tmp_path)
+    table = root / "data/chunk-000/file-000.parquet"
+    columns = pyarrow.parquet.read_table(table)
+    shown = io.BytesIO()
+    Image.fromarray(datasets.frames(datasets.LIFT)[0]).save(shown, format="PNG")
+    contents = [shown.getvalue(), *[postscript()] * (len(columns) - 1)]
+    images = pyarrow.array([{"bytes": content, "path": None} for content in contents])
+    pyarrow.parquet.write_table(columns.append_column("observation.images.side", images), table)
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"]["observation.images.side"] = {"dtype": "image", "shape": [3, 128, 128]}
+    (root / "meta/info.json").write_text(json.dumps(info))
+    with open_source(root) as source:
+        first = source.image("0", "observation.images.side", 0)
+        np.testing.assert_array_equal(first, datasets.frames(datasets.LIFT)[0])
+        with pytest.raises(TruncatedError, match="not a whole picture of the kinds PNG, JPEG"):
+            source.image("0", "observation.images.side", 1)
+    assert ghostscript == []
 
 
 # ------------------------------------------------------------------------------------ checkpoints

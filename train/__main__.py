@@ -22,6 +22,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         from palm_jax.train import devices, interrupts, recorded, run, training
         from palm_jax.train.data.errors import DataError
         from palm_jax.train.demos import DemoFileError
+        from palm_jax.train.evaluate import out_of_memory
         from palm_jax.train.learner import NonFiniteError
         from palm_jax.train.locks import Busy
         from palm_jax.train.records import RecordError
@@ -56,8 +57,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         if devices.is_first():
             terminal.interrupted(console, configuration.resume_command(config))
         # What all processes agreed on ends all of them in order.
-        return 130 if isinstance(stop, training.Interrupted) else devices.leave(130)
-    except Exception:
+        return 130 if isinstance(stop, training.Interrupted) else interrupts.leave(stop)
+    except Exception as error:
+        if out_of_memory(error):
+            why = str(error).partition("\n")[0]
+            print(
+                "error: the devices' memory does not suffice: lower --batch-size, --image-size or "
+                f"--width, or use devices with more ({why})",
+                file=sys.stderr,
+            )
+            return devices.leave(1)
         if devices.alone():
             raise
         traceback.print_exc()

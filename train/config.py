@@ -33,6 +33,7 @@ class Learning:
       seed: of training. Demonstrations and evaluation scenes have seeds of their own.
       out: the run folder; by default one in runs/ that is named after the main options.
       resume: go on with the run in `out`.
+      take_over: also if a process on another machine has claimed `out`: only if it is gone.
       data: demonstrations to use (made if the file does not exist); by default inside `out`. With
         --calibration: recordings of any robot, a robomimic file or a LeRobot folder.
       image_size: side of the policy's image in pixels, before the random crop.
@@ -61,6 +62,7 @@ class Learning:
     seed: int = 0
     out: Path | None = None
     resume: bool = False
+    take_over: bool = False
     data: Path | None = None
     image_size: int = 64
     random_crop: int = 58
@@ -402,7 +404,7 @@ def command(config: Learning, *, resume: bool = False) -> list[str]:
     words += ["--preset", config.preset]
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        if field.name in ("preset", "resume") or value == getattr(base, field.name):
+        if field.name in ("preset", "resume", "take_over") or value == getattr(base, field.name):
             continue
         flag = f"--{field.name.replace('_', '-')}"
         if isinstance(value, bool):

@@ -14,9 +14,7 @@ import dataclasses
 import functools
 import ipaddress
 import itertools
-import os
 import re
-import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -26,6 +24,8 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from orbax.checkpoint import multihost
+
+from palm_jax.train import interrupts
 
 AXIS = "data"
 AGREE_EVERY = 25  # updates between two agreements to stop; each costs all processes a round trip
@@ -120,9 +120,7 @@ def leave(status: int) -> int:
     """The exit status of a process that fails, which does not wait for the others to end: JAX ends
     them when it is gone, where an orderly exit would wait for them for minutes."""
     if not alone():
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
+        interrupts.end(status)
     return status
 
 

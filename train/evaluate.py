@@ -3,6 +3,7 @@
 import dataclasses
 import zlib
 from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -17,6 +18,7 @@ from palm_jax.train.methods import Method
 from palm_jax.train.records import DomainRecord
 
 Watch = Callable[[State], None]
+Result = TypeVar("Result")
 
 VIEW = "front"
 """Name of the one camera view that policies see so far."""
@@ -86,6 +88,21 @@ class Runners:
     def worlds(self) -> dict[str, int]:
         """Worlds in a batch, of every robot that has a runner."""
         return {robot: runner.worlds for robot, runner in self._made.items()}
+
+    def fitting(self, robot: str, use: Callable[[Runner], Result]) -> Result:
+        """`use` of a robot's runner; again, from its beginning, with half as many worlds while they
+        do not fit into memory.
+
+        Raises:
+          MemoryError: not even one world fits.
+        """
+        while True:
+            try:
+                return use(self.of_robot(robot))
+            except jax.errors.JaxRuntimeError as error:
+                if not out_of_memory(error):
+                    raise
+                self.halve(robot, str(error).partition("\n")[0])
 
     def halve(self, robot: str, why: str) -> None:
         """Go on with half as many worlds.
@@ -163,19 +180,18 @@ class Evaluator:
         """
         robot = robot or self.runners.robot
         while first < count:
-            worlds = self.runners.of_robot(robot).worlds
             # The policy's noise comes in tables of so many rows, and a batch reads one of them.
-            table = first - first % NOISE_ROWS
-            rows = np.arange(first, min(first + worlds, count, table + NOISE_ROWS))
-            try:
-                found = self._batch(policy, scenes, params, rows, robot, watch)
-            except jax.errors.JaxRuntimeError as error:
-                if not out_of_memory(error):
-                    raise
-                self.runners.halve(robot, str(error).partition("\n")[0])
-            else:
-                yield rows, found
-                first, watch = first + len(rows), None
+            end = min(count, first - first % NOISE_ROWS + NOISE_ROWS)
+
+            def batch(
+                runner: Runner, first: int = first, end: int = end, watch: Watch | None = watch
+            ) -> tuple[np.ndarray, Episodes]:
+                rows = np.arange(first, min(first + runner.worlds, end))
+                return rows, self._batch(policy, scenes, params, rows, runner, watch)
+
+            rows, found = self.runners.fitting(robot, batch)
+            yield rows, found
+            first, watch = first + len(rows), None
 
     def _batch(
         self,
@@ -183,11 +199,10 @@ class Evaluator:
         scenes: jax.Array,
         params: EnvParams,
         rows: np.ndarray,
-        robot: str,
+        runner: Runner,
         watch: Watch | None,
     ) -> Episodes:
         """The episodes of consecutive rows, at most as many as the runner has worlds."""
-        runner = self.runners.of_robot(robot)
         table = int(rows[0]) - int(rows[0]) % NOISE_ROWS
         every = np.arange(rows[0], rows[0] + runner.worlds)
         found = runner.run(

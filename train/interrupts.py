@@ -1,16 +1,30 @@
 """Ctrl-C and SIGTERM: the first asks for an orderly end, the second ends the process at once.
 
-At once means by the system's own action, also while a program is being compiled and no Python runs:
-every file is written whole or not at all, so nothing has to be tidied up for that.
+Python's own handlers run between two of its instructions, and so not while a program is compiled or
+runs, nor at a barrier: for minutes, or hours. The system's handler writes a byte for each signal
+all the same (`signal.set_wakeup_fd`), and a thread that waits for these bytes tells the first and
+ends the process at the second. Every file is written whole or not at all, so nothing has to be
+tidied up for that. Only code that holds the interpreter's lock throughout delays it.
 """
 
+import contextlib
 import os
 import signal
+import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any
+from typing import Any, NoReturn
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+SAME = 0.2
+"""Seconds in which signals are one request: timeout(1) and some wrappers send each of them twice,
+to the process and to its group."""
+
+
+def _nothing() -> None:
+    pass
 
 
 class Stop:
@@ -23,40 +37,95 @@ class Stop:
     def __call__(self) -> bool:
         return self.asked
 
-    @contextmanager
-    def listening(self) -> Iterator[None]:
-        """While a signal is to be noted only."""
+    @contextlib.contextmanager
+    def listening(self, *, at_once: Callable[[], None] = _nothing) -> Iterator[None]:
+        """While a signal is to be noted only.
+
+        Args:
+          at_once: called in another thread before the second signal ends the process.
+        """
 
         def note() -> None:
             self.asked = True
-            # Not through sys.stderr, whose buffer the interrupted code may be holding.
-            os.write(2, f"\n{self._promise}\n".encode())
 
-        with _on_first_signal(note):
+        with _watching(note, self._promise, at_once):
             yield
 
 
-@contextmanager
+class Signalled(KeyboardInterrupt):
+    """Raised by a signal, wherever Python was."""
+
+
+@contextlib.contextmanager
 def raising() -> Iterator[None]:
-    """While SIGTERM is to do what Ctrl-C does: raise KeyboardInterrupt, once."""
+    """While SIGTERM is to do what Ctrl-C does: raise `Signalled`, once."""
 
     def interrupt() -> None:
-        raise KeyboardInterrupt
+        raise Signalled
 
-    with _on_first_signal(interrupt):
+    with _watching(interrupt, "Stopping; once more ends at once.", _nothing):
         yield
 
 
-@contextmanager
-def _on_first_signal(act: Callable[[], None]) -> Iterator[None]:
-    def handle(number: int, frame: Any) -> None:
-        for each in SIGNALS:
-            signal.signal(each, signal.SIG_DFL)
-        act()
+def leave(stop: KeyboardInterrupt) -> int:
+    """The exit status of a command that was interrupted, which ends here if a signal did it.
 
+    JAX goes on compiling in another thread, and crashes if the process ends in an orderly way.
+    """
+    if isinstance(stop, Signalled):
+        end(130)
+    return 130
+
+
+def end(status: int) -> NoReturn:
+    """Ends the process at once, with what it has said."""
+    with contextlib.suppress(OSError):
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(status)
+
+
+@contextlib.contextmanager
+def _watching(act: Callable[[], None], promise: str, at_once: Callable[[], None]) -> Iterator[None]:
+    """In the main thread: `act` runs there, at the first signal, as soon as Python does."""
+    acted = False
+
+    def handle(number: int, frame: Any) -> None:
+        nonlocal acted
+        if not acted:
+            acted = True
+            act()
+
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    watcher = threading.Thread(target=_watch, args=(reader, promise, at_once), daemon=True)
+    watcher.start()
     before = {number: signal.signal(number, handle) for number in SIGNALS}
+    outer = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     try:
         yield
     finally:
+        signal.set_wakeup_fd(outer)
         for number, handler in before.items():
             signal.signal(number, handler)
+        os.close(writer)  # which ends the watcher
+        watcher.join()
+        os.close(reader)
+
+
+def _watch(reader: int, promise: str, at_once: Callable[[], None]) -> None:
+    first: float | None = None
+    while numbers := os.read(reader, 64):
+        for number in numbers:
+            if number not in SIGNALS:
+                continue
+            if first is None:
+                first = time.monotonic()
+                # Not through sys.stderr, whose buffer the interrupted code may be holding.
+                with contextlib.suppress(OSError):
+                    os.write(2, f"\n{promise}\n".encode())
+            elif time.monotonic() > first + SAME:
+                try:
+                    at_once()
+                finally:
+                    os._exit(128 + number)

@@ -1,10 +1,11 @@
 """Who works where: claims on folders, and a lock around files that several processes write.
 
-A claim is a file `FOLDER/.claim`, made with O_EXCL, which says who works in the folder: the host,
-the processes by number and start, and since when. Two processes with the same folder therefore
-never run the same cell, nor train into the same run. A process that is started by the holder shares
-its claim. The claim of a host's own dead processes is taken over; whether those of another
-machine are alive cannot be seen from here, so they have to be given up by a person.
+A claim is a file `FOLDER/.claim`, which says who works in the folder: the host, the processes by
+number and start, since when, and for which job of a scheduler. Two processes with the same folder
+therefore never run the same cell, nor train into the same run. A process that is started by the
+holder shares its claim. The claim of a host's own dead processes is taken over. Whether those of
+another machine are alive cannot be seen from here: a job that Slurm has begun anew takes over what
+it held before, for Slurm ended that; anything else has to be given up by a person.
 
 `locked` is an advisory lock (flock) beside a file, for reading, changing and writing it. The kernel
 frees it with the process that held it. Claims are made and taken over under such a lock, too.
@@ -20,20 +21,18 @@ import os
 import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+from palm_jax.train.metrics import write_atomic
 
 CLAIM = ".claim"
 
+LEFT = 3
+"""Exit code of a command that left work to another process, which has not done it yet."""
+
 
 class Busy(RuntimeError):
-    """Another process holds the claim; the message names it and says what to do.
-
-    `elsewhere`: whether it is on another machine.
-    """
-
-    def __init__(self, message: str, *, elsewhere: bool = False) -> None:
-        super().__init__(message)
-        self.elsewhere = elsewhere
+    """Another process holds the claim; the message names it and says what to do."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,29 +48,36 @@ class Process:
     started: str
 
     @classmethod
+    def numbered(cls, pid: int) -> "Process":
+        """The one that has this number now."""
+        return cls(pid, _started(pid) or "")
+
+    @classmethod
     def own(cls) -> "Process":
         """The calling process."""
-        return cls(os.getpid(), _started(os.getpid()))
+        return cls.numbered(os.getpid())
 
     @property
     def alive(self) -> bool:
-        """Whether it still runs, asked on its own host."""
+        """Whether it still runs, asked on its own host. In doubt it does."""
         try:
             os.kill(self.pid, 0)
         except (ProcessLookupError, OverflowError):
             return False
         except PermissionError:
-            pass
-        return _started(self.pid) == self.started
+            pass  # another user's, whom /proc may hide
+        started = _started(self.pid)
+        return started is None or started == self.started
 
 
-def _started(pid: int) -> str:
-    """Boot and clock ticks since then at which a process began; "" for none, and for zombies."""
+def _started(pid: int) -> str | None:
+    """Boot and clock ticks since then at which a process began; "" for one that has ended and is
+    still listed, None if the system does not tell."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
-        return ""
+        return None
     return "" if fields[0] in "ZX" else f"{boot}/{fields[19]}"
 
 
@@ -84,23 +90,52 @@ def host() -> str:
     return f"{socket.gethostname()} {space}".strip()
 
 
+class Job(NamedTuple):
+    """What a scheduler calls the work that this process is part of.
+
+    Attributes:
+      name: "" without a scheduler.
+      attempt: how often the scheduler has begun it anew. It ends one before it begins the next, but
+        several processes of one attempt may live on several machines.
+    """
+
+    name: str = ""
+    attempt: int = 0
+
+    @classmethod
+    def own(cls) -> "Job":
+        """That of the calling process: Slurm's, whose number stays when a job is queued again."""
+        number, again = (os.environ.get(f"SLURM_{x}", "") for x in ("JOB_ID", "RESTART_COUNT"))
+        if not number:
+            return cls()
+        cluster = os.environ.get("SLURM_CLUSTER_NAME", "")
+        return cls(f"slurm {cluster} {number}", int(again) if again.isdecimal() else 0)
+
+    def follows(self, other: "Job") -> bool:
+        """Whether it is a later attempt at the same work."""
+        return bool(self.name) and self.name == other.name and self.attempt > other.attempt
+
+
 @dataclasses.dataclass(frozen=True)
 class _Owner:
     host: str
     processes: tuple[Process, ...]
     since: str  # for people: nothing is decided by the time of day
+    job: Job = Job()
 
     def store(self) -> str:
-        return json.dumps(dataclasses.asdict(self)) + "\n"
+        fields = {**dataclasses.asdict(self), "job": self.job.name, "attempt": self.job.attempt}
+        return json.dumps(fields) + "\n"
 
     @classmethod
     def read(cls, path: Path) -> "_Owner | None":
-        """None if there is no claim, or none that was written to its end."""
+        """None if there is no claim, or none that can be read."""
         try:
             found: dict[str, Any] = json.loads(path.read_text())
             processes = tuple(Process(int(p["pid"]), str(p["started"])) for p in found["processes"])
-            return cls(str(found["host"]), processes, str(found["since"]))
-        except (OSError, ValueError, KeyError, TypeError):
+            job = Job(str(found.get("job", "")), int(found.get("attempt", 0)))
+            return cls(str(found["host"]), processes, str(found["since"]), job)
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             return None
 
 
@@ -126,7 +161,7 @@ def claim(folder: str | Path, *, name: str = CLAIM, take_over: bool = False) -> 
             _refuse_if_alive(path, found, take_over=take_over)
         processes = (*found.processes, own) if found is not None and shared else (own,)
         since = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
-        _write(path, _Owner(host(), processes, since))
+        _write(path, _Owner(host(), processes, since, Job.own()))
     try:
         yield
     finally:
@@ -142,19 +177,18 @@ def claim(folder: str | Path, *, name: str = CLAIM, take_over: bool = False) -> 
 
 def _is_parent(owner: _Owner) -> bool:
     parent = os.getppid()
-    return owner.host == host() and Process(parent, _started(parent)) in owner.processes
+    return owner.host == host() and Process.numbered(parent) in owner.processes
 
 
 def _refuse_if_alive(path: Path, owner: _Owner, *, take_over: bool) -> None:
     pids = ", ".join(str(process.pid) for process in owner.processes)
     name = owner.host.partition(" ")[0]
     if owner.host != host():
-        if take_over:
+        if take_over or Job.own().follows(owner.job):
             return
         raise Busy(
-            f"{path.parent} has been in use since {owner.since} by process {pids} on {name}, "
-            f"which cannot be seen from here: if it is gone, delete {path}",
-            elsewhere=True,
+            f"{path.parent} has been in use since {owner.since} by process {pids} on {name}, which "
+            f"cannot be seen from here: if it is gone, call with --take-over, or delete {path}"
         )
     if any(process.alive for process in owner.processes):
         raise Busy(
@@ -164,11 +198,8 @@ def _refuse_if_alive(path: Path, owner: _Owner, *, take_over: bool) -> None:
 
 
 def _write(path: Path, owner: _Owner) -> None:
-    """Under the lock. A dead process's claim goes first, so that every claim is a new file."""
-    path.unlink(missing_ok=True)
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
-    with os.fdopen(descriptor, "w") as file:
-        file.write(owner.store())
+    """Under the lock. Whole or not at all: others may live by the claim that it replaces."""
+    write_atomic(path, owner.store().encode())
 
 
 @contextlib.contextmanager

@@ -118,7 +118,8 @@ def _parse(content: bytes) -> tuple[list[dict[str, Any]], int]:
             record = json.loads(line)
             if not isinstance(record["step"], int):
                 raise TypeError
-        except (ValueError, KeyError, TypeError):
+            json.dumps(record, allow_nan=False)  # 1e999 can be read, but not written again
+        except (ValueError, KeyError, TypeError, RecursionError):
             damaged += line is not tail and bool(line.strip())
         else:
             records.append(record)

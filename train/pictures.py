@@ -1,12 +1,39 @@
-"""Reading a folder of pictures, for the user's own backgrounds."""
+"""Reading pictures: the one place where Pillow opens what somebody else has made."""
 
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".webp"}
-_FORMATS = ("PNG", "JPEG", "BMP", "WEBP")
+FORMATS = ("PNG", "JPEG", "BMP", "WEBP")
+"""All that is read. Pillow goes by the content and knows many more; for PostScript, whatever the
+file's name, it starts Ghostscript, which runs the program that such a file is."""
+
+
+def rgb(source: Path | BinaryIO, size: int | None = None) -> np.ndarray:
+    """A picture as uint8 [H, W, 3].
+
+    Args:
+      source: its file, or its bytes as a file.
+      size: height and width to resize to (aspect ignored); None for its own.
+
+    Raises:
+      ValueError: it is of none of the `FORMATS`, damaged or too large; the message says which, not
+        where.
+    """
+    try:
+        with Image.open(source, formats=FORMATS) as picture:
+            found = picture.convert("RGB")
+            return np.asarray(found if size is None else found.resize((size, size)))
+    # Damaged PNG files end in a SyntaxError; too many pixels in an error, or a warning first.
+    except (
+        OSError, ValueError, SyntaxError, Image.DecompressionBombError,
+        Image.DecompressionBombWarning,
+    ) as error:  # fmt: skip
+        words = f"not a whole picture of the kinds {', '.join(FORMATS)} ({error})"
+        raise ValueError(words) from error
 
 
 def read_folder(folder: Path, size: int, *, most: int = 512) -> np.ndarray:
@@ -21,9 +48,7 @@ def read_folder(folder: Path, size: int, *, most: int = 512) -> np.ndarray:
     pictures = []
     for file in files:
         try:
-            # Named, because Pillow starts Ghostscript for a file that is PostScript inside.
-            with Image.open(file, formats=_FORMATS) as picture:
-                pictures.append(np.asarray(picture.convert("RGB").resize((size, size))))
-        except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
+            pictures.append(rgb(file, size))
+        except ValueError as error:
             raise ValueError(f"{file} cannot be read as a picture: {error}") from error
     return np.stack(pictures)

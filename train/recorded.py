@@ -133,7 +133,7 @@ def execute(config: Recorded, console: Console) -> Path:
     devices.Split.over(jax.devices()).check(config.batch_size)
     assert config.data is not None and config.calibration is not None
     with (
-        locks.claim(out),
+        locks.claim(out, take_over=config.take_over),
         open_recording(config.data, config.calibration, camera=config.camera) as recording,
     ):
         return _execute(config, recording, out, console)
@@ -235,7 +235,8 @@ class _Job:
         config = dataclasses.replace(
             self.config, task=self.config.task or str(facts["recorded_task"])
         )
-        fields = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+        names = [f.name for f in dataclasses.fields(config) if f.name not in workspace.NOT_STORED]
+        fields = {name: getattr(config, name) for name in names}
         spec = dataclasses.asdict(self.spec)
         values: dict[str, Any] = plain(
             {
@@ -410,7 +411,7 @@ def _picture(jobs: Sequence[_Job], out: Path) -> None:
     for each in jobs:
         path = each.folder / "views.npz"
         if path.exists():
-            rows.append(list(records.load_arrays(path).values())[:_SHOWN])
+            rows.append(list(records.load_views(path).values())[:_SHOWN])
             names.append(paper.method_label(each.method.name))
     rows = [row for row in rows if len(row) == _SHOWN]
     if rows:

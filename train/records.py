@@ -111,7 +111,9 @@ def domain_record(values: Mapping[str, ArrayLike], *, where: str = "record") -> 
     missing = sorted(set(_DTYPES) - set(values))
     if missing:
         raise RecordError(f"{where}: missing {', '.join(missing)}; expected {', '.join(_DTYPES)}")
-    arrays = {name: np.asarray(values[name]).astype(kind) for name, kind in _DTYPES.items()}
+    arrays = {
+        name: _numbers(f"{where}/{name}", values[name], kind) for name, kind in _DTYPES.items()
+    }
     count = arrays["success"].shape[0] if arrays["success"].ndim else 0
     for name, array in arrays.items():
         expected = (count, 2) if name == "object_xy" else (count,)
@@ -121,6 +123,19 @@ def domain_record(values: Mapping[str, ArrayLike], *, where: str = "record") -> 
                 f"got {array.shape}"
             )
     return DomainRecord(**arrays)
+
+
+def _numbers(where: str, value: ArrayLike, kind: Any) -> NDArray[Any]:
+    """An array of this kind; one of other numbers may come, if it says the same."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "biuf":
+        raise RecordError(f"{where}: expected numbers, got {array.dtype}")
+    with np.errstate(invalid="ignore", over="ignore"):
+        found = array.astype(kind)
+        whole = found.dtype.kind == "f" or np.array_equal(found, array)
+    if not whole or not np.isfinite(found).all():
+        raise RecordError(f"{where}: expected finite {found.dtype} numbers, got others")
+    return found
 
 
 def _refuse_unknown(where: object, found: Iterable[str], known: Iterable[str]) -> None:
@@ -217,9 +232,10 @@ def load_strengths(path: Path) -> StrengthSweep:
     missing = {field.name for field in fields(StrengthSweep)} - {"worlds", *arrays}
     if missing:
         raise RecordError(f"{path}: missing {', '.join(sorted(missing))}")
-    strengths = np.atleast_1d(arrays["strengths"]).astype(float)
-    success, nan = arrays["success"].astype(bool), arrays["nan"].astype(bool)
-    if success.ndim != 2 or len(success) != len(strengths) or nan.shape != success.shape:
+    strengths = np.atleast_1d(_numbers(f"{path}: strengths", arrays["strengths"], float))
+    success, nan = (_numbers(f"{path}: {name}", arrays[name], bool) for name in ("success", "nan"))
+    axes = (strengths.ndim, success.ndim) == (1, 2)
+    if not axes or len(success) != len(strengths) or nan.shape != success.shape:
         raise RecordError(
             f"{path}: expected success and nan of shape [{len(strengths)}, S], "
             f"got {success.shape} and {nan.shape}"
@@ -243,6 +259,15 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
             return {name: archive[name] for name in archive.files}
     except Exception as error:  # damaged bytes make zipfile and NumPy raise whatever comes to mind
         raise RecordError(f"{path}: not a readable .npz file ({error})") from error
+
+
+def load_views(path: Path) -> dict[str, NDArray[np.uint8]]:
+    """Read views.npz: images [H, W, 3] by name."""
+    views = load_arrays(path)
+    for name, view in views.items():
+        if view.dtype != np.uint8 or view.shape[2:] != (3,) or not view.size:
+            raise RecordError(f"{path}: {name}: expected an image, got {view.dtype} {view.shape}")
+    return views
 
 
 def _check_directory(content: bytes, count: int) -> None:
@@ -282,9 +307,14 @@ def load_sweep(path: Path) -> Sweep:
     missing = {"angles", "xs", "ys", "success"} - set(arrays)
     if missing:
         raise RecordError(f"{path}: missing {', '.join(sorted(missing))}")
-    success = arrays["success"].astype(bool)
-    nan = arrays.get("nan", np.zeros_like(success)).astype(bool)
-    angles, xs, ys = (np.atleast_1d(arrays[name]).astype(float) for name in ("angles", "xs", "ys"))
+    success = _numbers(f"{path}: success", arrays["success"], bool)
+    nan = _numbers(f"{path}: nan", arrays.get("nan", np.zeros_like(success)), bool)
+    angles, xs, ys = (
+        np.atleast_1d(_numbers(f"{path}: {name}", arrays[name], float))
+        for name in ("angles", "xs", "ys")
+    )
+    if not angles.ndim == xs.ndim == ys.ndim == 1:
+        raise RecordError(f"{path}: expected angles, xs and ys with one axis each")
     grid = (len(angles), len(xs), len(ys))
     for name, array in (("success", success), ("nan", nan)):
         if array.ndim != 4 or array.shape[:3] != grid or array.shape != success.shape:
@@ -299,7 +329,7 @@ def load_json(path: Path) -> dict[str, Any]:
     """Read a JSON object."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise RecordError(f"{path}: not readable as JSON ({error})") from error
     if not isinstance(content, dict):
         raise RecordError(f"{path}: expected a JSON object, got {type(content).__name__}")
@@ -313,7 +343,7 @@ def load_counts(path: Path) -> dict[str, dict[str, int]]:
         try:
             good, total = int(entry["successes"]), int(entry["episodes"])
             nan = int(entry.get("nan", 0))
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
             raise RecordError(
                 f"{path}: {domain}: expected successes, episodes and nan, got {entry!r}"
             ) from error

@@ -1,10 +1,12 @@
 """The main job: demonstrations, then training and evaluation of each method, a report."""
 
 import dataclasses
+import functools
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -31,8 +33,18 @@ from palm_jax.train import (
     workspace,
 )
 from palm_jax.train.config import Config, default_out
-from palm_jax.train.evaluate import VIEW, Evaluator, Runners, evaluate, quoted, turned
+from palm_jax.train.evaluate import (
+    VIEW,
+    Evaluator,
+    Runners,
+    evaluate,
+    out_of_memory,
+    quoted,
+    turned,
+)
 from palm_jax.train.metrics import write_json
+
+Drawn = TypeVar("Drawn")
 
 _FILMED = ("workspace+viewpoint", "workspace+viewpoint+embodiment")
 """Domains of which videos are made, where they are evaluated."""
@@ -61,7 +73,7 @@ def execute(config: Config, console: Console) -> Path:
     if not devices.is_first():
         _take_part(config)
         return out
-    with locks.claim(out):
+    with locks.claim(out, take_over=config.take_over):
         return _execute(config, out, console)
 
 
@@ -203,14 +215,24 @@ def _collect(config: Config, runner: Runner, path: Path, console: Console) -> No
             bar.advance(kept - done)
             done = kept
 
-        demos.collect(
-            runner,
-            path,
-            count=config.demos,
-            seed=config.demo_seed,
-            noise=config.demo_noise,
-            progress=progress,
-        )
+        try:
+            demos.collect(
+                runner,
+                path,
+                count=config.demos,
+                seed=config.demo_seed,
+                noise=config.demo_noise,
+                progress=progress,
+            )
+        except jax.errors.JaxRuntimeError as error:
+            if not out_of_memory(error):
+                raise
+            # Not with fewer: what is drawn depends on the number.
+            why = str(error).partition("\n")[0]
+            raise MemoryError(
+                f"{runner.worlds} worlds do not fit into memory to collect demonstrations: "
+                f"lower --scenes, which is their number, or give --data ({why})"
+            ) from error
 
 
 def _one_method(
@@ -231,8 +253,16 @@ def _one_method(
 
 def _samples(config: Config, evaluator: Evaluator, data: demos.Demos) -> learner.Batch:
     """The demonstrations as the method sees them."""
+    runners = evaluator.runners
+    return runners.fitting(runners.robot, lambda runner: _rendered(config, evaluator, runner, data))
+
+
+def _rendered(
+    config: Config, evaluator: Evaluator, runner: Runner, data: demos.Demos
+) -> learner.Batch:
+    """`_samples`, so many worlds at a time as the runner has."""
     method = evaluator.method
-    spec, runner = method.spec(evaluator.task, config.image_size), evaluator.runner
+    spec = method.spec(evaluator.task, config.image_size)
     images, proprio, cameras = demos.render_observations(runner, data, spec, frame=method.frame)
     batch = learner.Batch(
         {VIEW: images}, proprio, data.actions, cameras={VIEW: cameras}, tcp=data.tcp[:, :3, 3]
@@ -326,27 +356,33 @@ def _film(
     method = evaluator.method
     spec = method.spec(evaluator.task, config.image_size)
 
-    def camera(domain: str) -> films.Camera:
+    def drawn(domain: str, draw: Callable[[films.Camera], Drawn]) -> Drawn:
         scenes = evaluator.scenes(
             domain, seed=config.eval_seed, count=config.scenes, aligned=aligned
         )
-        return films.Camera(evaluator.runners.domain(domain), scenes, spec, method.frame)
+        return evaluator.runners.fitting(
+            evaluator.runners.plays(domain),
+            lambda runner: draw(films.Camera(runner, scenes, spec, method.frame)),
+        )
 
     views: dict[str, np.ndarray] = {}
     for domain, trace in traces.items():
-        views[f"input/{domain}"], views[f"frame/{domain}"] = camera(domain).first(trace)
+        views[f"input/{domain}"], views[f"frame/{domain}"] = drawn(
+            domain, functools.partial(films.Camera.first, trace=trace)
+        )
     records.save_arrays(folder / "views.npz", views)
     for domain in [d for d in _FILMED if d in traces] or list(traces)[:1]:
-        _film_domain(config, method, domain, camera(domain), traces[domain], folder)
+        film = functools.partial(_film_domain, config, method, domain, traces[domain], folder)
+        drawn(domain, film)
 
 
 def _film_domain(
     config: Config,
     method: methods.Method,
     domain: str,
-    camera: films.Camera,
     trace: films.Trace,
     folder: Path,
+    camera: films.Camera,
 ) -> None:
     """The first `config.videos` successes and failures of one domain."""
     solved = np.stack(trace.solved)[:, : config.scenes].any(axis=0)
@@ -395,7 +431,7 @@ def _gallery(folders: dict[str, Path], out: Path, console: Console) -> None:
     for name, folder in folders.items():
         path = folder / "views.npz"
         try:
-            views = records.load_arrays(path) if path.exists() else {}
+            views = records.load_views(path) if path.exists() else {}
         except records.RecordError as error:
             console.print(f"{error}; left out of the gallery", markup=False)
             continue

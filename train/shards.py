@@ -65,7 +65,7 @@ def load(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     arrays = records.load_arrays(path)
     try:
         header = json.loads(str(arrays.pop(HEADER)))
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, RecursionError) as error:
         raise ShardError(f"{path}: not a shard of a sweep (no readable header)") from error
     if not isinstance(header, dict):
         raise ShardError(f"{path}: not a shard of a sweep (its header is no object)")

@@ -59,6 +59,7 @@ class SweepConfig:
       shard: "i/n", the i-th of n machines (from 1): it runs its part of the grid's batches, or of
         the strengths, into RUN/shards.
       merge: join the shards of this very command into one sweep; nothing is run.
+      take_over: sweep what a process on another machine has claimed, too: only if it is gone.
     """
 
     run: tyro.conf.Positional[Path]
@@ -73,6 +74,7 @@ class SweepConfig:
     redo: bool = False
     shard: str = ""
     merge: bool = False
+    take_over: bool = False
 
 
 def angles_of(text: str) -> np.ndarray:
@@ -372,25 +374,26 @@ def job(config: SweepConfig) -> Job:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command; returns the exit code."""
+    """The command; returns the exit code, 3 if something is left to another process."""
     config = tyro.cli(SweepConfig, args=argv, prog="python -m palm_jax sweep")
     console = terminal.make_console()
     try:
         with interrupts.raising():
-            _run(config, console)
+            left = _run(config, console)
     except (ValueError, OSError, MemoryError) as error:
         console.print(f"error: {error}", markup=False)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         console.print("Stopped; the same command goes on with the batch that was running.")
-        return 130
-    if config.shard:
-        return 0  # the report is for the one who joins the shards
-    return report.main([str(config.run)])
+        return interrupts.leave(stop)
+    # With shards, the report is for the one who joins them.
+    code = 0 if config.shard else report.main([str(config.run)])
+    return code or (locks.LEFT if left else 0)
 
 
-def _run(config: SweepConfig, console: Console) -> None:
-    """Sweeps every run that the command is about, and writes the files."""
+def _run(config: SweepConfig, console: Console) -> list[Path]:
+    """Sweeps every run that the command is about, and writes the files; returns those that are left
+    to another process."""
     asked, shard = job(config), shards.parse(config.shard) if config.shard else (1, 1)
     if config.shard and config.merge:
         raise ValueError("shard, merge: expected one of them; --merge alone joins the shards")
@@ -400,6 +403,7 @@ def _run(config: SweepConfig, console: Console) -> None:
     if not folders:
         raise FileNotFoundError(f"{config.run}: no run folder here")
     runners: dict[tuple[str, str], Runners] = {}
+    left: list[Path] = []
     for folder in folders:
         stored = workspace.stored_config(folder)
         robot = config.robot or stored.robot
@@ -426,10 +430,13 @@ def _run(config: SweepConfig, console: Console) -> None:
                 tell=lambda text: console.print(text, style="bold", markup=False),
             )
         try:
-            with locks.claim(folder, name=f".{into.stem}.claim"):
+            name = f".{into.stem}.claim"
+            with locks.claim(folder, name=name, take_over=config.take_over):
                 _sweep_one(folder, into, asked, config, runners[world], console)
         except locks.Busy as error:
             console.print(f"{into} is left to another process: {error}", markup=False)
+            left.append(into)
+    return left
 
 
 def _sweep_one(

@@ -31,9 +31,9 @@ from rich.console import Console
 
 from palm_jax.envs.registry import TASKS
 from palm_jax.envs.shifts import DOMAINS
+from palm_jax.train import compiled, interrupts, locks, methods, records, table_page, workspace
 from palm_jax.train import config as configuration
 from palm_jax.train import console as terminal
-from palm_jax.train import interrupts, locks, methods, records, table_page, workspace
 from palm_jax.train.config import Config, ConfigError
 from palm_jax.train.metrics import plain, write_json
 
@@ -272,8 +272,7 @@ def run(config: TableConfig, console: Console) -> Path:
                     _announce(console, cell, len(missing) - number, took)
                     _run_cell(config, cell, fresh, console, took)
         except locks.Busy as error:
-            hint = ", or call with --take-over" if error.elsewhere else ""
-            console.print(f"{cell.name} is left to another process: {error}{hint}", markup=False)
+            console.print(f"{cell.name} is left to another process: {error}", markup=False)
     return config.file
 
 
@@ -368,7 +367,7 @@ def _train(config: Config, log: Path) -> int:
             [sys.executable, *words[1:]],
             stdout=output,
             stderr=subprocess.STDOUT,
-            env=_environment(config.data.parents[1]),
+            env=_environment(),
             close_fds=False,
             process_group=0,
         )
@@ -379,7 +378,7 @@ def _outcome(process: subprocess.Popen[bytes]) -> int:
     """Waits for a cell. A signal is passed on: the cell saves, and goes on another time."""
     stop = interrupts.Stop("Stopping after the running cell has saved; once more ends at once.")
     try:
-        with stop.listening():
+        with stop.listening(at_once=process.kill):
             while process.poll() is None and not stop():
                 time.sleep(_POLL_S)
             if stop():
@@ -392,14 +391,19 @@ def _outcome(process: subprocess.Popen[bytes]) -> int:
     return code
 
 
-def _environment(folder: Path) -> dict[str, str]:
+def _environment() -> dict[str, str]:
     """The cells of a table share compiled programs; and memory in large pages, which glibc must be
-    told before a process begins, trains a fifth faster (docs/performance.md)."""
+    told before a process begins, trains a fifth faster (docs/performance.md).
+
+    Raises:
+      CacheError: see `compiled.folder`.
+    """
     ours = {
-        "JAX_COMPILATION_CACHE_DIR": str((folder / "compiled").resolve()),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
         "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
     }
+    if compiled.VARIABLE not in os.environ and (folder := compiled.folder()) is not None:
+        ours[compiled.VARIABLE] = str(folder)
     return {**ours, **os.environ}
 
 
@@ -447,7 +451,8 @@ def _cells_of(table: dict[str, Any], part: str) -> Iterator[Cell]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command; returns the exit code."""
+    """The command; returns the exit code: 0, or 1 if cells failed, 2 for a command that cannot be
+    run, 3 if cells of the share are not done, 130 when interrupted."""
     config = tyro.cli(TableConfig, args=argv, prog="python -m palm_jax table")
     console = terminal.make_console()
     try:
@@ -457,13 +462,22 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         with interrupts.raising():
             path = run(config, console)
-    except (ConfigError, records.RecordError, OSError) as error:
+    except (ConfigError, compiled.CacheError, records.RecordError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         console.print("Stopped; the same command goes on with what is missing.")
-        return 130
-    failed = list(_cells_of(records.load_json(path), "failed")) if path.exists() else []
+        return interrupts.leave(stop)
+    return _summary(config, path, console)
+
+
+def _summary(config: TableConfig, path: Path, console: Console) -> int:
+    """Tells what has failed and what is not done; returns the exit code."""
+    table = records.load_json(path) if path.exists() else {}
+    failed = list(_cells_of(table, "failed"))
+    left = [] if config.merge else [c for c in cells(config) if _get(table, "results", c) is None]
+    left = [cell for cell in left if cell not in failed]
     words = f"; {len(failed)} cells failed" if failed else ""
+    words += f"; {len(left)} cells are left to other processes" if left else ""
     console.print(f"Results: {path}{words}", markup=False)
-    return 1 if failed else 0
+    return 1 if failed else locks.LEFT if left else 0

@@ -89,7 +89,7 @@ class Training:
                     checkpoint.FINGERPRINT: self.belongs,
                 }
                 path = checkpoint.save(store, step, state, meta, keep=config.keep)
-                if not stop():
+                if not (stop() or together.agreed):
                     found = self._score_if_missing(path, step, state)
                     if found is not None:
                         log.write(step, found.logged)

@@ -9,6 +9,8 @@ import platform
 import shlex
 import subprocess
 import tempfile
+import types
+import typing
 from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
@@ -41,13 +43,13 @@ _FREE = ("out", "resume", "data", "calibration", "sweep", "videos", "method")
 RECORDED = "recorded"
 """What config.json says under "kind" of a run on recordings; nothing of one in the simulator."""
 
-_NOT_STORED = ("distributed",)
+NOT_STORED = ("distributed", "take_over")
 """Fields of the machines alone: no run folder holds them."""
 
 
 def stored(config: Config, method: str) -> dict[str, Any]:
     """What `config.json` of one method's run folder holds."""
-    names = [f.name for f in dataclasses.fields(Config) if f.name not in _NOT_STORED]
+    names = [f.name for f in dataclasses.fields(Config) if f.name not in NOT_STORED]
     values = {name: getattr(config, name) for name in names}
     low, high = shifts.TEST_LOW, shifts.TEST_HIGH
     regions = {
@@ -126,7 +128,7 @@ def environment(config: Learning, *, wall_s: float) -> dict[str, Any]:
         "devices": [str(device) for device in jax.devices()],
         "versions": versions(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
-        "commit": _commit(),
+        "commit": commit(),
         "wall_s": round(wall_s, 1),
     }
 
@@ -155,7 +157,8 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def _commit() -> str | None:
+def commit() -> str | None:
+    """The commit of this very code, "-dirty" behind it if it was changed; None outside of git."""
     try:
         # Without cwd and close_fds Python spawns instead of forking, which JAX's threads forbid.
         found = subprocess.run(
@@ -202,19 +205,57 @@ def stored_config(folder: Path) -> Config:
 
 
 def config_in(folder: Path, kind: type[AnyConfig]) -> AnyConfig:
-    """What `config.json` holds, as the command saw it."""
-    values = records.load_json(folder / "config.json")
-    names = [f.name for f in dataclasses.fields(kind) if f.name not in _NOT_STORED]
+    """What `config.json` holds, as the command saw it.
+
+    Raises:
+      RecordError: it cannot be read.
+      ConfigError: a field is missing, or says what no command can; the message names it.
+    """
+    path = folder / "config.json"
+    values = records.load_json(path)
+    names = [f.name for f in dataclasses.fields(kind) if f.name not in NOT_STORED]
     missing = sorted(set(names) - set(values))
     if missing:
-        raise ConfigError(f"{folder}/config.json lacks {', '.join(missing)}: another version's run")
-    chosen = {name: values[name] for name in names}
+        raise ConfigError(f"{path} lacks {', '.join(missing)}: another version's run")
+    chosen = {name: values[name] for name in names} | {"method": [values["method"]]}
+    hints = typing.get_type_hints(kind)
+    for name, value in chosen.items():
+        if not _fits(value, hints[name]):
+            raise ConfigError(f"{path}: {name}: expected {_words(hints[name])}, got {value!r:.80}")
     for name in ("out", "data", "backgrounds", "calibration"):
         if chosen.get(name) is not None:
             chosen[name] = Path(chosen[name])
     chosen = {name: tuple(v) if isinstance(v, list) else v for name, v in chosen.items()}
-    chosen["method"] = (values["method"],)
-    return kind(**chosen)
+    config = kind(**chosen)
+    try:
+        # Pictures that were there then need not be there now.
+        dataclasses.replace(config, backgrounds=None).check()
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    return config
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value of a JSON file can be one of a configuration's field."""
+    inner = typing.get_args(hint)
+    if isinstance(hint, types.UnionType):
+        return any(_fits(value, one) for one in inner)
+    if typing.get_origin(hint) is tuple:
+        if not isinstance(value, list):
+            return False
+        kinds = inner[:1] * len(value) if inner[-1] is Ellipsis else inner
+        return len(value) == len(kinds) and all(map(_fits, value, kinds))
+    if hint in (int, float):
+        wanted = int if hint is int else (int, float)
+        whole = isinstance(value, wanted) and not isinstance(value, bool)
+        return whole and abs(value) < 2**63
+    if hint is Path:
+        return isinstance(value, str) and "\0" not in value
+    return isinstance(value, hint)
+
+
+def _words(hint: Any) -> str:
+    return getattr(hint, "__name__", "") if isinstance(hint, type) else str(hint)
 
 
 def make_evaluator(config: Config, method: methods.Method, runners: Runners) -> Evaluator:

@@ -153,6 +153,11 @@ def _config_json(folder: Path) -> Path:
     return folder / "config.json"
 
 
+def _read_config(path: Path) -> Any:
+    """As `sweep` and the policies read it."""
+    return vars(workspace.stored_config(path.parent))
+
+
 def _claim(folder: Path) -> Path:
     with locks.claim(folder):
         content = (folder / locks.CLAIM).read_text()
@@ -182,7 +187,7 @@ _READERS: tuple[tuple[str, Any, Any, tuple[type[Exception], ...], bool], ...] = 
     ("a checkpoint's manifest", _manifest, _read_checkpoint, _CHECKPOINT, True),
     ("a checkpoint's arrays", _arrays, _read_checkpoint, _CHECKPOINT, True),
     ("table.json", _table_json, _read_table, (*_RECORD, ConfigError), True),
-    ("config.json", _config_json, records.load_json, _RECORD, False),
+    ("config.json", _config_json, _read_config, (*_RECORD, ConfigError), False),
     ("a claim", _claim, _read_claim, (), False),
 )
 

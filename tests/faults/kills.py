@@ -1,5 +1,6 @@
 """Processes that are killed, and asked to stop."""
 
+import functools
 import json
 import multiprocessing
 import os
@@ -15,7 +16,7 @@ from typing import Any
 from faults import workers
 from faults.cases import Outcome, case, logged, same_arrays
 
-from palm_jax.train import checkpoint, records, table, table_page
+from palm_jax.train import checkpoint, interrupts, records, table, table_page
 
 KILLS = 25
 _SERVER = multiprocessing.get_context("forkserver")
@@ -215,16 +216,17 @@ for _number in (signal.SIGINT, signal.SIGTERM):
 def _asked_twice(folder: Path) -> Outcome:
     expected = whole(workers.train, folder / "whole")
     stopped = folder / "stopped"
-    process = start(workers.train, stopped)
+    process = start(functools.partial(workers.train, hesitation=60.0), stopped)
     wait_for(process, stopped, 20)
     os.kill(process.pid or 0, signal.SIGTERM)
     while "Stopping after" not in (stopped / "output").read_text() and process.is_alive():
-        time.sleep(0.0005)
-    os.kill(process.pid or 0, signal.SIGTERM)
+        time.sleep(0.01)
+    time.sleep(2 * interrupts.SAME)
+    os.kill(process.pid or 0, signal.SIGINT)
     begin = time.monotonic()
     process.join()
     took = time.monotonic() - begin
-    assert process.exitcode in (-signal.SIGTERM, 130) and took < 2, (process.exitcode, took)
+    assert process.exitcode == 128 + signal.SIGINT and took < 2, (process.exitcode, took)
     whole(workers.train, stopped)
     same_arrays(expected / "final.npz", stopped / "final.npz")
     return Outcome("ends at once; goes on to the same bytes", "at most one interval, repeated")

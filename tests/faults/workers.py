@@ -50,8 +50,9 @@ def _quiet(folder: Path) -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
-def train(folder: Path) -> None:
-    """A training with real checkpoints; leaves final.npz. Ends with 130 when asked to stop."""
+def train(folder: Path, *, hesitation: float = 0.0) -> None:
+    """A training with real checkpoints; leaves final.npz. Ends with 130 when asked to stop, which
+    takes `hesitation` seconds more."""
     _quiet(folder)
     model, store, stop = learner.make_learner(CONFIG, 3), folder / "checkpoints", interrupts.Stop()
     with stop.listening():
@@ -75,7 +76,9 @@ def train(folder: Path) -> None:
                 log_every=1,
                 on_log=on_log,
                 checkpoint_every=EVERY,
-                on_checkpoint=lambda step, state: _save(store, step, state),
+                on_checkpoint=lambda step, state: _save(
+                    store, step, state, pause=hesitation if stop() else 0.0
+                ),
                 should_stop=stop,
             )
     if stop():
@@ -85,7 +88,8 @@ def train(folder: Path) -> None:
     records.save_arrays(folder / "final.npz", arrays)
 
 
-def _save(store: Path, step: int, state: learner.TrainState) -> None:
+def _save(store: Path, step: int, state: learner.TrainState, *, pause: float) -> None:
+    time.sleep(pause)
     checkpoint.save(store, step, state, keep=1)
 
 

@@ -9,15 +9,20 @@ import shutil
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
+import tiny
+from rich.console import Console
 
 from palm_jax.train import __main__ as training
 from palm_jax.train import checkpoint, devices, learner, run
 from palm_jax.train.devices import DeviceError, Split, Together
+from palm_jax.train.training import Interrupted, Score, Training
 
 SCRIPT = Path(__file__).with_name("devices_process.py")
 ROOT = Path(__file__).resolve().parents[2]
@@ -189,6 +194,37 @@ def test_a_process_alone_waits_for_nobody() -> None:
     assert not stop() and not stop.agreed
     asked[0] = True
     assert stop() and stop.agreed
+
+
+def test_who_leaves_scores_no_checkpoint_whoever_was_asked(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Another process was: the others wait for this one."""
+
+    class Asked:
+        agreed = True
+
+        def __init__(self, asked: Callable[[], bool]) -> None:
+            assert not asked()
+
+        def __call__(self) -> bool:
+            return True
+
+    def stopping(*_: Any, should_stop: Any, on_checkpoint: Any, **__: Any) -> None:
+        assert should_stop()
+        on_checkpoint(2, tiny.state("bc", 2))
+
+    def score(step: int, state: learner.TrainState) -> Score:
+        raise AssertionError("a selection is played")
+
+    monkeypatch.setattr(devices, "Together", Asked)
+    monkeypatch.setattr(learner, "run", stopping)
+    config = dataclasses.replace(tiny.config("bc"), steps=4, checkpoint_every=2)
+    job = Training(config, "bc", tiny.learner("bc"), tmp_path, "x", score, augment=False)
+    nothing = learner.Batch({}, np.zeros((0, 1)), np.zeros((0, 1)))
+    with pytest.raises(Interrupted):
+        job.train(nothing, Console())
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["2"]
 
 
 def test_as_many_devices_as_divide_the_worlds(monkeypatch: pytest.MonkeyPatch) -> None:

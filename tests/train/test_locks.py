@@ -1,9 +1,9 @@
 """Claims and locks between processes: one at a time, and the dead do not hold anything."""
 
+import errno
 import json
 import multiprocessing
 import os
-import signal
 import subprocess
 import sys
 import threading
@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from palm_jax.train import interrupts, locks
+from palm_jax.train import config as configuration
+from palm_jax.train import locks, run, workspace
+from palm_jax.train.__main__ import main
 
 ROOT = Path(__file__).resolve().parents[2]
 HOLDER = """
@@ -121,14 +123,124 @@ def test_waiting_is_told(tmp_path: Path) -> None:
     held.join()
 
 
-def test_a_signal_is_noted_and_the_next_is_deadly() -> None:
-    before = signal.getsignal(signal.SIGTERM)
-    stop = interrupts.Stop()
-    with stop.listening():
-        assert not stop()
-        os.kill(os.getpid(), signal.SIGTERM)
-        assert stop() and signal.getsignal(signal.SIGINT) is signal.SIG_DFL
-    assert signal.getsignal(signal.SIGTERM) is before
-    with pytest.raises(KeyboardInterrupt), interrupts.raising():
-        os.kill(os.getpid(), signal.SIGTERM)
-    assert signal.getsignal(signal.SIGTERM) is before
+def foreign(folder: Path, **fields: object) -> None:
+    """A claim of a process on another machine."""
+    folder.mkdir(parents=True, exist_ok=True)
+    process = {"pid": os.getpid(), "started": ""}
+    owner = {"host": "elsewhere", "processes": [process], "since": "noon", **fields}
+    (folder / locks.CLAIM).write_text(json.dumps(owner))
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "taken"),
+    [
+        ({"JOB_ID": "7"}, {"JOB_ID": "7", "RESTART_COUNT": "1"}, True),
+        ({"JOB_ID": "7", "RESTART_COUNT": "2"}, {"JOB_ID": "7", "RESTART_COUNT": "10"}, True),
+        # The same attempt: another node of the job, where it may be alive.
+        ({"JOB_ID": "7"}, {"JOB_ID": "7"}, False),
+        ({"JOB_ID": "7", "RESTART_COUNT": "2"}, {"JOB_ID": "7", "RESTART_COUNT": "2"}, False),
+        ({"JOB_ID": "7", "RESTART_COUNT": "2"}, {"JOB_ID": "7", "RESTART_COUNT": "1"}, False),
+        ({"JOB_ID": "7"}, {"JOB_ID": "8", "RESTART_COUNT": "1"}, False),
+        ({"JOB_ID": "7", "CLUSTER_NAME": "a"},
+         {"JOB_ID": "7", "CLUSTER_NAME": "b", "RESTART_COUNT": "1"}, False),
+        ({}, {"JOB_ID": "7", "RESTART_COUNT": "1"}, False),
+        ({}, {"RESTART_COUNT": "1"}, False),
+        ({"JOB_ID": "7"}, {"JOB_ID": "7", "RESTART_COUNT": "many"}, False),
+    ],
+)  # fmt: skip
+def test_a_job_that_slurm_begins_anew_takes_over_what_it_held(
+    before: dict[str, str],
+    now: dict[str, str],
+    taken: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def within(names: dict[str, str], host: str) -> None:
+        for name in ("JOB_ID", "RESTART_COUNT", "CLUSTER_NAME"):
+            monkeypatch.delenv(f"SLURM_{name}", raising=False)
+        for name, value in names.items():
+            monkeypatch.setenv(f"SLURM_{name}", value)
+        monkeypatch.setattr(locks, "host", lambda: host)
+
+    within(before, "node1")
+    with locks.claim(tmp_path):
+        left = (tmp_path / locks.CLAIM).read_text()
+    (tmp_path / locks.CLAIM).write_text(left)
+    within(now, "node2")
+    if taken:
+        with locks.claim(tmp_path):
+            assert json.loads((tmp_path / locks.CLAIM).read_text())["host"] == "node2"
+    else:
+        with pytest.raises(locks.Busy, match="on node1.*call with --take-over, or delete"):
+            with locks.claim(tmp_path):
+                pass
+        assert (tmp_path / locks.CLAIM).read_text() == left
+        with locks.claim(tmp_path, take_over=True):
+            pass
+
+
+@pytest.mark.parametrize("content", ["1e999", "[" * 100_000, "null", '"many"', "[1]"])
+def test_a_claim_that_says_nonsense_holds_nothing(content: str, tmp_path: Path) -> None:
+    for good in ("41", "42"):
+        claim = (
+            '{"host": "x", "processes": [{"pid": 41, "started": ""}], "since": "", "attempt": 42}'
+        )
+        (tmp_path / locks.CLAIM).write_text(claim.replace(good, content))
+        with locks.claim(tmp_path):
+            pass
+        (tmp_path / locks.CLAIM).write_text(claim)
+        with pytest.raises(locks.Busy), locks.claim(tmp_path):
+            pass
+
+
+def test_another_users_process_that_the_system_hides_is_alive(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """/proc with hidepid: a signal is not permitted, and nothing else is said."""
+
+    def kill(pid: int, number: int) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "kill", kill)
+    hidden = Path("/proc/4194305/stat")
+    assert not hidden.exists() and locks.Process(4194305, "boot/1").alive
+    # Where it does say who has the number now, that counts.
+    assert not locks.Process(os.getpid(), "boot/1").alive
+
+
+def test_a_claim_stays_until_the_next_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A child that joins may be killed, or find no room, while its parent works."""
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    process = holder(tmp_path)
+    before = (tmp_path / locks.CLAIM).read_bytes()
+    owner = locks._Owner.read(tmp_path / locks.CLAIM)
+    assert owner is not None
+    for name in ("fsync", "replace"):
+        with monkeypatch.context() as patch, pytest.raises(OSError, match="No space left"):
+            patch.setattr(os, name, full)
+            locks._write(tmp_path / locks.CLAIM, owner)
+        assert (tmp_path / locks.CLAIM).read_bytes() == before
+    process.communicate("\n")
+    assert {path.name for path in tmp_path.iterdir()} == {".claim.lock"}
+
+
+def test_a_training_takes_over_what_it_is_told_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begun: list[Path] = []
+    monkeypatch.setattr(run, "_execute", lambda config, out, console: begun.append(out) or out)
+    foreign(tmp_path / "run")
+    words = ["--out", str(tmp_path / "run")]
+    assert main(words) == 2 and not begun
+    assert "by process" in (said := capsys.readouterr().err) and "--take-over" in said
+    assert main([*words, "--take-over"]) == 0 and begun == [tmp_path / "run"]
+    config = configuration.parse([*words, "--take-over"])
+    assert isinstance(config, configuration.Config)
+    # It is no part of what the run is, and not proposed for the next time.
+    assert "take_over" not in workspace.stored(config, "palm")
+    assert "--take-over" not in configuration.resume_command(config)

@@ -131,6 +131,19 @@ def test_what_is_done_is_not_done_again(
     assert checkpoint.content_hash(run / "palm" / "checkpoints" / "4") == before
 
 
+def test_another_machines_claim_is_taken_over_when_told(
+    run: Path, calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = Path(shutil.copytree(run / "palm", tmp_path / "claimed"))
+    claim = {"host": "elsewhere", "processes": [{"pid": 1, "started": ""}], "since": "noon"}
+    (out / ".claim").write_text(json.dumps(claim))
+    command = words(calibrated, out, "--method", "palm", "--resume")
+    assert main(command) == 2
+    assert "--take-over" in capsys.readouterr().err
+    assert main([*command, "--take-over"]) == 0
+    assert "take_over" not in config_of(out) and not (out / ".claim").exists()
+
+
 def test_a_resumed_training_is_the_whole_one(run: Path, calibrated: Path, tmp_path: Path) -> None:
     out = tmp_path / "cut"
     shutil.copytree(run / "palm", out)

@@ -1,6 +1,7 @@
 """Sweeps: what is asked for, in which order it runs, and where its results end up."""
 
 import dataclasses
+import json
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -8,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import rooms
+import tiny
 
 from palm_jax.envs import make
 from palm_jax.envs.base import EnvParams
-from palm_jax.train import records, runs, shards, sweep
+from palm_jax.train import locks, records, runs, shards, sweep
 from palm_jax.train.shards import ShardError
 from palm_jax.train.sweep import SweepConfig
 
@@ -276,6 +278,22 @@ def test_wrong_sweep_commands_are_told(tmp_path: Path, capsys: pytest.CaptureFix
     ):
         assert sweep.main(words) == 2
         assert message in " ".join(capsys.readouterr().out.split())
+
+
+def test_what_is_left_to_another_process_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, swept = tiny.write(tmp_path / "run"), []
+    monkeypatch.setattr(sweep.Runners, "of", lambda *_, **__: None)
+    monkeypatch.setattr(sweep, "_sweep_one", lambda folder, *_: swept.append(folder))
+    claim = {"host": "elsewhere", "processes": [{"pid": 1, "started": ""}], "since": "noon"}
+    name = ".sweep-1-of-2.claim"
+    (folder / name).write_text(json.dumps(claim))
+    words = [str(folder), "--shard", "1/2"]
+    assert sweep.main(words) == locks.LEFT == 3 and not swept
+    said = " ".join(capsys.readouterr().out.split())
+    assert "is left to another process" in said and "--take-over" in said
+    assert sweep.main([*words, "--take-over"]) == 0 and swept == [folder]
 
 
 class Killed(Exception):

@@ -210,12 +210,15 @@ def test_two_processes_never_run_the_same_cell(
     here = locks.Process.own()
     claim = {"processes": [dataclasses.asdict(here)], "since": "noon"}
     (other / locks.CLAIM).write_text(json.dumps({**claim, "host": locks.host()}))
-    assert run(config) == 0 and trainer.asked == ["lift_spam/palm-s0"]
+    assert run(config) == locks.LEFT == 3 and trainer.asked == ["lift_spam/palm-s0"]
     said = " ".join(capsys.readouterr().out.split())
     assert f"in use since noon by process {here.pid} on this machine" in said
+    assert said.endswith("1 cells are left to other processes")
+    # Those of another share do not count.
+    assert run(dataclasses.replace(config, shard="2/2")) == 0
     # Of another machine: only when told.
     (other / locks.CLAIM).write_text(json.dumps({**claim, "host": "elsewhere"}))
-    assert run(config) == 0 and len(trainer.asked) == 1
+    assert run(config) == locks.LEFT and len(trainer.asked) == 1
     said = " ".join(capsys.readouterr().out.split())
     assert "on elsewhere, which cannot be seen from here" in said and "--take-over" in said
     assert run(dataclasses.replace(config, take_over=True)) == 0
@@ -259,6 +262,7 @@ def test_a_signal_lets_the_running_cell_save(
         dataclasses.replace(SMALL, out=tmp_path), table.Cell("lift_lid", "palm", 0)
     )
     log = tmp_path / "cell.log"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(configuration, "command", lambda *_, **__: ["python", "-c", STUBBORN])
 
     def when_ready() -> None:

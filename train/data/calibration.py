@@ -421,7 +421,7 @@ def load(path: Path) -> Calibration:
             f"{path}: no such file; make one: `python -m palm_jax data calibrate --from robosuite|"
             f"mujoco|maniskill|droid|npy ... --out {path}`"
         ) from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise CalibrationError(f"{path}: not a readable JSON file ({error})") from error
     try:
         return from_json(content)
@@ -496,7 +496,7 @@ def _object(value: Any, where: str) -> dict[str, Any]:
 def _array(value: Any, where: str) -> np.ndarray:
     try:
         array = np.asarray(value, np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise CalibrationError(f"{where}: expected numbers ({error})") from error
     if not np.isfinite(array).all():
         raise CalibrationError(f"{where}: expected finite numbers")

@@ -705,7 +705,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (DataError, OptionError) as error:
         print(f"error: {type(error).__name__}: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         saved = "finished episodes" if words[0] == "align" else ""
         terminal.interrupted(console, ["python", "-m", "palm_jax", "data", *words], saved=saved)
-        return 130
+        return interrupts.leave(stop)

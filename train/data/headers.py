@@ -7,7 +7,6 @@ expected and what came.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -23,7 +22,8 @@ VIDEO_NUMBERS = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 def is_number(value: Any) -> bool:
     """Whether a value is a finite number, and not a truth value."""
     known = isinstance(value, (int, float, np.integer, np.floating))
-    return known and not isinstance(value, bool) and math.isfinite(value)
+    # Whole numbers of JSON may be longer than any of NumPy's.
+    return known and not isinstance(value, bool) and abs(value) < 2**63
 
 
 def parsed(text: Any, where: str) -> dict[str, Any]:
@@ -34,7 +34,7 @@ def parsed(text: Any, where: str) -> dict[str, Any]:
     """
     try:
         content = json.loads(text)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise FormatError(f"{where}: expected JSON, got {_shown(text)} ({error})") from error
     return an_object(content, where)
 
@@ -93,7 +93,7 @@ def camera_info(text: Any, where: str) -> dict[str, dict[str, Any]]:
 def _is_matrix(value: Any, size: int) -> bool:
     try:
         matrix = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return False
     return matrix.shape == (size, size) and bool(np.isfinite(matrix).all())
 

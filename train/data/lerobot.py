@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
+from palm_jax.train import pictures
 from palm_jax.train.data import headers, video
 from palm_jax.train.data.errors import FormatError, KeyMissingError, TruncatedError
 from palm_jax.train.data.source import Feature, Source
@@ -51,7 +51,7 @@ class LeRobotSource(Source):
     def _json(self, name: str) -> dict[str, Any]:
         try:
             content = json.loads((self.path / name).read_text())
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise FormatError(f"{self.path / name}: not readable ({error})") from error
         return headers.an_object(content, str(self.path / name))
 
@@ -175,9 +175,8 @@ class LeRobotSource(Source):
         content = item.get("bytes")
         source: Any = io.BytesIO(content) if content else self.path / str(item.get("path"))
         try:
-            with Image.open(source) as picture:
-                return np.asarray(picture.convert("RGB"))
-        except (OSError, ValueError) as error:
+            return pictures.rgb(source)
+        except ValueError as error:
             raise TruncatedError(f"{self.path}: an image that cannot be read ({error})") from error
 
     def image(self, episode: str, key: str, index: int) -> np.ndarray:
