@@ -212,7 +212,7 @@ def _distances(recording: Recording, episode: str) -> np.ndarray:
 
 def _note_environment(config: Recorded, folder: Path, wall_s: float) -> None:
     path = folder / "env.json"
-    earlier = training.noted(path).get("wall_s", 0.0)
+    earlier = records.seconds(records.load_notes(path), "wall_s") or 0.0
     write_json(path, workspace.environment(config, wall_s=earlier + wall_s))
 
 

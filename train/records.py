@@ -13,6 +13,7 @@ names the file and the problem.
 
 import io
 import json
+import math
 import re
 import struct
 import warnings
@@ -304,6 +305,22 @@ def load_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise RecordError(f"{path}: expected a JSON object, got {type(content).__name__}")
     return content
+
+
+def load_notes(path: Path) -> dict[str, Any]:
+    """A JSON object on which no result rests: empty if it is absent or damaged."""
+    try:
+        return load_json(path)
+    except RecordError:
+        return {}
+
+
+def seconds(notes: Mapping[str, Any], name: str) -> float | None:
+    """A time that was noted; None if it was not, or is none."""
+    value = notes.get(name)
+    if isinstance(value, (int, float)) and 0 <= value < math.inf:
+        return float(value)
+    return None
 
 
 def load_counts(path: Path) -> dict[str, dict[str, int]]:

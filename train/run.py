@@ -167,7 +167,7 @@ def _note_environment(
     config: Config, folder: Path, wall_s: float, worlds: Mapping[str, int]
 ) -> None:
     path = folder / "env.json"
-    earlier = training.noted(path).get("wall_s", 0.0)
+    earlier = records.seconds(records.load_notes(path), "wall_s") or 0.0
     found = workspace.environment(config, wall_s=earlier + wall_s)
     write_json(path, {**found, "worlds": dict(worlds)})
 

@@ -313,21 +313,33 @@ def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
     _keep_episodes(config.file, {cell: records.load_eval(folder / "eval.npz")})
     _put(table, "results", cell, records.load_counts(folder / "eval.json"))
     _drop(table, "failed", cell)
-    if (folder / "times.json").exists():
-        _put(table, "times", cell, records.load_json(folder / "times.json"))
+    times = records.load_notes(folder / "times.json")
+    if _took(times):
+        _put(table, "times", cell, times)
     _note_speed(table)
+
+
+def _took(times: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Seconds of training and of the evaluation, from a cell's times.json; None if one of them is
+    not known: a process that is killed after its results are written leaves no time for them."""
+    training, selection, evaluation = (
+        records.seconds(times, f"{name}_s")
+        for name in ("training_and_selection", "selection", "evaluation")
+    )
+    training = None if training is None else training - (selection or 0.0)
+    return (training, evaluation) if training and training > 0 and evaluation is not None else None
 
 
 def _note_speed(table: dict[str, Any]) -> None:
     """Medians over the cells, into the header: samples a second, seconds of an evaluation."""
-    times = [t for cell in _cells_of(table, "times") if (t := _get(table, "times", cell))]
+    every = (_get(table, "times", cell) or {} for cell in _cells_of(table, "times"))
+    took = list(filter(None, map(_took, every)))
     recipe, header = table["header"]["recipe"], table["header"]
-    samples = recipe["steps"] * recipe["batch_size"]
-    training = [t["training_and_selection_s"] - t.get("selection_s", 0.0) for t in times]
-    if training:
-        header["samples_per_second"] = round(samples / statistics.median(training), 1)
-        seconds = statistics.median(t["evaluation_s"] for t in times)
-        header["evaluation_seconds"] = round(seconds, 1)
+    if took:
+        training, evaluation = map(statistics.median, zip(*took, strict=True))
+        samples = recipe["steps"] * recipe["batch_size"]
+        header["samples_per_second"] = round(samples / training, 1)
+        header["evaluation_seconds"] = round(evaluation, 1)
 
 
 def _keep_episodes(table: Path, fresh: Mapping[Cell, Mapping[str, records.DomainRecord]]) -> None:

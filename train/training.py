@@ -5,10 +5,10 @@ What is trained on, and what makes one checkpoint better than another, is the ca
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 from rich.console import Console
@@ -155,14 +155,6 @@ def timed(folder: Path, what: str) -> Iterator[None]:
         yield
     finally:
         path = folder / "times.json"
-        times = dict(noted(path))
-        times[what] = round(times.get(what, 0.0) + time.monotonic() - start, 2)
-        write_json(path, times)
-
-
-def noted(path: Path) -> Mapping[str, Any]:
-    """What a file of notes holds, nothing if it is absent or damaged: no result rests on it."""
-    try:
-        return records.load_json(path)
-    except records.RecordError:
-        return {}
+        times = dict(records.load_notes(path))
+        earlier = records.seconds(times, what) or 0.0
+        write_json(path, {**times, what: round(earlier + time.monotonic() - start, 2)})

@@ -20,6 +20,8 @@ SMALL = TableConfig(
     preset="quick", tasks=("lift_lid", "lift_spam"), methods=("arro", "bc", "palm"), seeds=(0, 1)
 )
 
+TIMES = {"training_and_selection_s": 30.0, "selection_s": 6.0, "evaluation_s": 10.0}
+
 
 class Trainer:
     """Stands in for the training process."""
@@ -28,6 +30,7 @@ class Trainer:
         self.asked: list[str] = []
         self.failing: set[str] = set()
         self.stop_at: str | None = None
+        self.times = json.dumps(TIMES)
         monkeypatch.setattr(table, "_train", self)
 
     def __call__(self, config: Config, log: Path) -> int:
@@ -46,8 +49,7 @@ class Trainer:
             "object_xy": np.zeros((24, 2)), "camera_angle": np.zeros(24), "length": np.ones(24),
         }  # fmt: skip
         records.save_eval(config.out / "eval.npz", {"in_domain": episodes})
-        took = {"training_and_selection_s": 30.0, "selection_s": 6.0, "evaluation_s": 10.0}
-        (config.out / "times.json").write_text(json.dumps(took))
+        (config.out / "times.json").write_text(self.times)
         return 0
 
 
@@ -182,6 +184,32 @@ def test_the_header_tells_the_speed(tmp_path: Path, trainer: Trainer) -> None:
     header = json.loads(config.file.read_text())["header"]
     assert header["samples_per_second"] == 2400 * 32 / (30.0 - 6.0)
     assert header["evaluation_seconds"] == 10.0
+
+
+@pytest.mark.parametrize(
+    "left",
+    [
+        '{"training_and_selection_s": 30.0, "selection_s": 6.0}',  # killed before the last number
+        '{"training_and_selection_s": 30.0, "evaluation_s": null}',
+        '{"training_and_selection_s": "30", "evaluation_s": 10.0}',
+        "{",
+    ],
+)
+def test_a_cell_whose_times_are_not_known_is_entered(
+    left: str, tmp_path: Path, trainer: Trainer
+) -> None:
+    """Its results are whole: no further command would ever write the times."""
+    config = dataclasses.replace(SMALL, out=tmp_path, seeds=(0,), methods=("palm",))
+    trainer.times = left
+    assert run(config) == 0
+    stored = json.loads(config.file.read_text())
+    assert set(stored["results"]) == {"lift_lid", "lift_spam"} and not stored.get("times")
+    assert "samples_per_second" not in stored["header"]
+    # The next cells' times count alone.
+    trainer.times = json.dumps(TIMES)
+    assert run(dataclasses.replace(config, methods=("bc",))) == 0
+    header = json.loads(config.file.read_text())["header"]
+    assert header["samples_per_second"] == 2400 * 32 / 24.0
 
 
 @pytest.mark.parametrize(
