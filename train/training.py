@@ -35,6 +35,14 @@ class Score(NamedTuple):
     logged: dict[str, float]  # what the log of the training says of it
 
 
+class _Begun(NamedTuple):
+    """A checkpoint to go on from."""
+
+    step: int
+    path: Path
+    state: learner.TrainState
+
+
 @dataclasses.dataclass(frozen=True)
 class Training:
     """One policy's training.
@@ -65,7 +73,8 @@ class Training:
           NonFiniteError: see `learner.run`; the message names a dump.
         """
         config, store = self.config, self.folder / "checkpoints"
-        state, done = self._resumed(console)
+        begun = self._begun(console)
+        done = begun.step if begun else 0
         dumped = debug.dumping(self.folder / debug.DUMPS, self.model)
         stop = interrupts.Stop(PROMISE)
         together = devices.Together(stop)
@@ -88,11 +97,10 @@ class Training:
                     "task": config.task,
                     checkpoint.FINGERPRINT: self.belongs,
                 }
+                log.sync()  # a checkpoint on the disk has its log there
                 path = checkpoint.save(store, step, state, meta, keep=config.keep)
-                if not stop():
-                    found = self._score_if_missing(path, step, state)
-                    if found is not None:
-                        log.write(step, found.logged)
+                if not together.agreed:
+                    self._score_if_missing(path, step, state, log)
                 devices.wait()
 
             def on_failure(failure: learner.Failure) -> None:
@@ -100,11 +108,13 @@ class Training:
                 devices.wait()
 
             with timed(self.folder, "training_and_selection_s"), dumped as dump:
+                if begun:
+                    self._score_if_missing(begun.path, done, begun.state, log)
                 learner.run(
                     self.model,
                     data,
                     seed=config.seed,
-                    state=state,
+                    state=begun.state if begun else None,
                     bank=backgrounds(config) if self.augment else None,
                     log_every=LOG_EVERY,
                     on_log=on_log,
@@ -117,27 +127,36 @@ class Training:
         if together.agreed:
             raise Interrupted
 
-    def _resumed(self, console: Console) -> tuple[learner.TrainState | None, int]:
-        """The newest valid checkpoint, scored, and its step; None and 0 if there is none."""
+    def _begun(self, console: Console) -> "_Begun | None":
+        """Where the training goes on: the newest valid checkpoint, if there is one."""
         found = checkpoint.latest_valid(self.folder / "checkpoints", fingerprint=self.belongs)
         if not found:
-            return None, 0
-        done, path = found
-        state = checkpoint.load(path, self.model.abstract_state())
-        if done < self.config.steps:
-            terminal.resumed(console, f"{self.name}, step {done} of {self.config.steps}")
-        self._score_if_missing(path, done, state)
-        return state, done
-
-    def _score_if_missing(self, path: Path, step: int, state: learner.TrainState) -> Score | None:
-        """The score of a checkpoint, written into its meta data; None if it is not scored now."""
-        if checkpoint.SCORE in checkpoint.read_meta(path):
             return None
+        step, path = found
+        state = checkpoint.load(path, self.model.abstract_state())
+        if step < self.config.steps:
+            terminal.resumed(console, f"{self.name}, step {step} of {self.config.steps}")
+        return _Begun(step, path, state)
+
+    def _score_if_missing(
+        self, path: Path, step: int, state: learner.TrainState, log: MetricsLog
+    ) -> None:
+        """Writes the score of a checkpoint into the log and then into its meta data.
+
+        One that a stop has left between two others is never scored: a training that was interrupted
+        chooses among the checkpoints of one that was not.
+        """
+        if step % self.config.checkpoint_every and step != self.config.steps:
+            return
+        if checkpoint.SCORE in checkpoint.read_meta(path):
+            return
         with timed(self.folder, "selection_s"):
             found = self.score(step, state)
         if found is not None:
+            # Killed in between, the checkpoint is scored again, to the same row.
+            log.write_once(step, found.logged)
+            log.sync()
             checkpoint.update_meta(path, **{checkpoint.SCORE: found.rank})
-        return found
 
 
 def backgrounds(config: Learning) -> jax.Array:
