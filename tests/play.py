@@ -172,6 +172,15 @@ def assert_same(one: Path, other: Path) -> None:
     assert scores(one) == scores(other)
 
 
+def tree(folder: Path) -> dict[str, bytes]:
+    """All files below a folder, by name."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
 def scores(folder: Path) -> dict[int, float]:
     """Of the checkpoints that have one."""
     found = {}

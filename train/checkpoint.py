@@ -28,7 +28,7 @@ import math
 import os
 import platform
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -335,7 +335,7 @@ def steps(directory: str | Path) -> list[tuple[int, Path]]:
 
 
 def latest_valid(
-    directory: str | Path, *, repair: bool = True, fingerprint: str | None = None
+    directory: str | Path, *, repair: bool = True, fingerprints: Collection[str] = ()
 ) -> tuple[int, Path] | None:
     """The newest checkpoint that is whole, as (step, folder), or None if there is none.
 
@@ -344,15 +344,15 @@ def latest_valid(
       repair: move damaged checkpoints, and those that a killed process left half-written, to
         `directory/damaged/STEP-REASON`, and log a warning for each. False only looks: for readers
         of a folder into which another process may be writing.
-      fingerprint: a checkpoint whose meta data have another `FINGERPRINT` is another run's, and
-        treated like a damaged one.
+      fingerprints: if given, a checkpoint whose meta data have a `FINGERPRINT` that is none of them
+        is another run's, and treated like a damaged one.
     """
     directory = Path(directory)
     if repair and directory.is_dir():
         _sweep_leftovers(directory)
     for step, path in reversed(steps(directory)):
         try:
-            _refuse_foreign(path, verify(path), fingerprint)
+            _refuse_foreign(path, verify(path), fingerprints)
         except DamagedCheckpoint as damage:
             if repair:
                 _set_aside(path, f"{step}-{damage.reason}", str(damage))
@@ -361,9 +361,9 @@ def latest_valid(
     return None
 
 
-def _refuse_foreign(path: Path, manifest: Mapping[str, Any], fingerprint: str | None) -> None:
+def _refuse_foreign(path: Path, manifest: Mapping[str, Any], fingerprints: Collection[str]) -> None:
     found = manifest["meta"].get(FINGERPRINT)
-    if fingerprint is not None and found is not None and found != fingerprint:
+    if fingerprints and found is not None and found not in fingerprints:
         raise DamagedCheckpoint(path, "foreign", "belongs to a run with other options")
 
 
@@ -503,18 +503,18 @@ def update_meta(path: str | Path, **values: Any) -> None:
 
 
 def best(
-    directory: str | Path, *, count: int = 1, score: str = SCORE, fingerprint: str | None = None
+    directory: str | Path, *, count: int = 1, score: str = SCORE, fingerprints: Collection[str] = ()
 ) -> list[tuple[int, Path]]:
     """Up to `count` whole checkpoints by falling score, the newer first among equals.
 
-    Those without a finite score, and those of another `fingerprint`, are never among them.
+    Those without a finite score, and another run's (see `latest_valid`), are never among them.
     """
     ranked: list[tuple[int, Path]] = []
     for step, path in _ranked(Path(directory), score):
         if len(ranked) == count:
             break
         try:
-            _refuse_foreign(path, verify(path), fingerprint)
+            _refuse_foreign(path, verify(path), fingerprints)
         except DamagedCheckpoint as damage:
             _log.warning("checkpoint passed over: %s", damage)
         else:

@@ -57,6 +57,7 @@ class Demos:
     camera_to_world: np.ndarray  # [E, 4, 4]
     params: EnvParams  # leading axis [E]
     attempts: int  # episodes that the expert needed
+    digest: str  # SHA-256 of everything in the file
 
     @property
     def episodes(self) -> int:
@@ -265,7 +266,8 @@ def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None
         if found != value:
             advice = "; move it away and collect again" if name == "version" else ""
             raise DemoFileError(f"{path}: expected {name} {value!r}, found {found!r}{advice}")
-    if _DIGEST in data.attrs and data.attrs[_DIGEST] != _digest(data):
+    digest = _digest(data)
+    if data.attrs.get(_DIGEST, digest) != digest:
         raise DemoFileError(
             f"{path}: the content differs from what was written; move it away and collect again"
         )
@@ -297,6 +299,7 @@ def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None
         camera_to_world=np.stack([demo.attrs["camera_to_world"] for demo in demos]),
         params=EnvParams(**{name: jnp.asarray(value) for name, value in params.items()}),
         attempts=int(data.attrs["attempts"]),
+        digest=digest,
     )
 
 

@@ -152,6 +152,7 @@ def _execute(config: Recorded, recording: Recording, out: Path, console: Console
     facts = _facts(recording, split)
     for each in jobs:
         workspace.begin_run(each.stored(facts), each.folder, resume=config.resume)
+        workspace.bind_backgrounds(each.folder, config, each.method)
     terminal.header(console, "palm_jax", _header(config, recording, survey, split, out))
     found = {}
     for each in jobs:
@@ -259,11 +260,10 @@ class _Job:
         model = learner.make_learner(
             self.config.learner(self.method), self.spec.proprio_size, (VIEW,)
         )
-        belongs = workspace.fingerprint_of(self.stored(facts))
         with self._aligned("train", self.split.train, console) as data:
             with self._aligned("check", self.split.held_out, console) as checked:
-                self._training(model, belongs, checked).train(data, console)
-                step, best = workspace.best_checkpoint(self.folder, belongs)
+                self._training(model, checked).train(data, console)
+                step, best = workspace.best_checkpoint(self.folder)
                 policy = model.policy_state(checkpoint.load(best, model.abstract_state()))
                 found = held_out.measure(model, policy, checked) if len(checked.proprio) else {}
             self._note_views(data)
@@ -271,9 +271,7 @@ class _Job:
         write_json(path, {"step": step, "episodes": len(self.split.held_out), **found})
         return found
 
-    def _training(
-        self, model: learner.Learner, belongs: str, checked: learner.Batch
-    ) -> training.Training:
+    def _training(self, model: learner.Learner, checked: learner.Batch) -> training.Training:
         def score(step: int, state: learner.TrainState) -> training.Score:
             if not len(checked.proprio):
                 return training.Score(float(step), {})
@@ -284,7 +282,7 @@ class _Job:
             )
 
         return training.Training(
-            self.config, self.method.name, model, self.folder, belongs, score, self.method.augment
+            self.config, self.method.name, model, self.folder, score, self.method.augment
         )
 
     @contextmanager

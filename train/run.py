@@ -30,7 +30,7 @@ from palm_jax.train import (
     videos,
     workspace,
 )
-from palm_jax.train.config import Config, default_out
+from palm_jax.train.config import Config, ConfigError, default_out
 from palm_jax.train.evaluate import VIEW, Evaluator, Runners, evaluate, quoted, turned
 from palm_jax.train.metrics import write_json
 
@@ -47,7 +47,7 @@ def execute(config: Config, console: Console) -> Path:
     Of several processes the first does all of it, and the others take part in the training alone.
 
     Raises:
-      ConfigError: the folder holds another run.
+      ConfigError: the folder holds another run, or one on other data.
       DeviceError: the devices do not divide the batch.
       DemoFileError: the demonstrations cannot be used.
       StartPoseError: a domain asks for start poses that an arm cannot take.
@@ -94,7 +94,13 @@ def _execute(config: Config, out: Path, console: Console) -> Path:
         name: workspace.make_evaluator(config, methods.find(name), runners) for name in folders
     }
     data = _demonstrations(config, runners.first, console)
+    for name, folder in folders.items():
+        workspace.bind_data(
+            folder, workspace.DEMONSTRATIONS, data.digest, _demonstration_file(config)
+        )
+        workspace.bind_backgrounds(folder, config, methods.find(name))
     devices.wait()  # the others read what is written now
+    _agree_on_data(config, data)
     for name, folder in folders.items():
         began = time.monotonic()
         _one_method(config, evaluators[name], data, folder, console)
@@ -123,6 +129,7 @@ def _take_part(config: Config) -> None:
     data = demos.load(
         _demonstration_file(config), task=config.task, robot=config.robot, count=config.demos
     )
+    _agree_on_data(config, data)
     for name in config.method:
         if devices.from_first(False):
             continue
@@ -149,6 +156,16 @@ def _share_training(config: Config, evaluator: Evaluator, data: learner.Batch) -
         )
     if together.agreed:
         raise training.Interrupted
+
+
+def _agree_on_data(config: Config, data: demos.Demos) -> None:
+    """Raises ConfigError in a process whose demonstrations are not those of the first."""
+    ours = np.frombuffer(bytes.fromhex(data.digest), np.uint8)
+    if not np.array_equal(devices.from_first(ours), ours):
+        raise ConfigError(
+            f"{_demonstration_file(config)}: other demonstrations than those of the first process: "
+            "--data must be the same file everywhere"
+        )
 
 
 def _robots(config: Config) -> str:
@@ -280,13 +297,11 @@ def _training(config: Config, evaluator: Evaluator, folder: Path) -> training.Tr
         return training.Score(success, {"in_domain_success": success})
 
     name = evaluator.method.name
-    belongs = workspace.fingerprint(config, name)
-    return training.Training(config, name, model, folder, belongs, score, evaluator.method.augment)
+    return training.Training(config, name, model, folder, score, evaluator.method.augment)
 
 
 def _evaluate(config: Config, evaluator: Evaluator, folder: Path, console: Console) -> None:
-    belongs = workspace.fingerprint(config, evaluator.method.name)
-    policy = workspace.best_policy(folder, evaluator.learner, belongs)
+    policy = workspace.best_policy(folder, evaluator.learner)
     traces: dict[tuple[str, str], films.Trace] = {}
 
     def watch(variant: str, domain: str) -> films.Trace:

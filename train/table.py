@@ -195,7 +195,7 @@ def read(path: Path, fresh: dict[str, Any]) -> dict[str, Any]:
       ConfigError: it was made under other conditions; the message names the field.
     """
     if not path.exists():
-        return {"header": fresh, "results": {}, "failed": {}}
+        return {"header": {**fresh}, "results": {}, "failed": {}}
     try:
         table: dict[str, Any] = records.load_json(path)
     except records.RecordError as error:
@@ -310,6 +310,7 @@ def _whole(folder: Path, console: Console) -> bool:
 def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
     """What a finished cell left in its folder, into the table and the file beside it."""
     folder = config.folder / cell.name
+    _note_demonstrations(table["header"], {cell.task: _trained_on(folder)}, folder)
     _keep_episodes(config.file, {cell: records.load_eval(folder / "eval.npz")})
     _put(table, "results", cell, records.load_counts(folder / "eval.json"))
     _drop(table, "failed", cell)
@@ -317,6 +318,30 @@ def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
     if _took(times):
         _put(table, "times", cell, times)
     _note_speed(table)
+
+
+def _trained_on(folder: Path) -> str | None:
+    """SHA-256 of a cell's demonstrations; None if nothing of it was noted."""
+    digests = records.load_notes(folder / "config.json").get(workspace.DIGESTS)
+    return digests.get(workspace.DEMONSTRATIONS) if isinstance(digests, dict) else None
+
+
+def _note_demonstrations(
+    header: dict[str, Any], found: Mapping[str, str | None], where: Path
+) -> None:
+    """Adds the SHA-256 of tasks' demonstrations to a header.
+
+    Raises:
+      ConfigError: it has others; the task is named.
+    """
+    known = header.setdefault(workspace.DEMONSTRATIONS, {})
+    for task, digest in found.items():
+        if digest is not None and known.setdefault(task, digest) != digest:
+            raise ConfigError(
+                f"{where}: demonstrations of {task} with SHA-256 {digest[:12]}, but the table was "
+                f"begun with {known[task][:12]}: results of two kinds are not mixed. Give all "
+                "shards the same OUT/demos, or choose another --json and --out"
+            )
 
 
 def _took(times: Mapping[str, Any]) -> tuple[float, float] | None:
@@ -418,6 +443,8 @@ def _environment(folder: Path) -> dict[str, str]:
 def _merge(table: dict[str, Any], path: Path, fresh: dict[str, Any]) -> list[Cell]:
     """Takes over what only the other file has; returns the cells that came with results."""
     other, taken = read(path, fresh), []
+    demonstrations = other["header"].get(workspace.DEMONSTRATIONS, {})
+    _note_demonstrations(table["header"], demonstrations, path)
     for cell in _cells_of(other, "results"):
         if _get(table, "results", cell) is None:
             _put(table, "results", cell, _get(other, "results", cell))

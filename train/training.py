@@ -14,7 +14,16 @@ import jax
 from rich.console import Console
 
 from palm_jax.align import procedural_bank
-from palm_jax.train import checkpoint, debug, devices, interrupts, learner, pictures, records
+from palm_jax.train import (
+    checkpoint,
+    debug,
+    devices,
+    interrupts,
+    learner,
+    pictures,
+    records,
+    workspace,
+)
 from palm_jax.train import console as terminal
 from palm_jax.train.config import Learning
 from palm_jax.train.metrics import MetricsLog, write_json
@@ -51,8 +60,7 @@ class Training:
       config: steps, seed, checkpoints.
       name: of the method.
       model: what is trained.
-      folder: of the run.
-      belongs: fingerprint of the run; checkpoints of others are not used.
+      folder: of the run; its config.json tells its checkpoints from others'.
       score: of a checkpoint (step, state); None where it is not to be scored.
       augment: whether images are augmented, which takes backgrounds.
     """
@@ -61,7 +69,6 @@ class Training:
     name: str
     model: learner.Learner
     folder: Path
-    belongs: str
     score: Callable[[int, learner.TrainState], Score | None]
     augment: bool
 
@@ -73,6 +80,7 @@ class Training:
           NonFiniteError: see `learner.run`; the message names a dump.
         """
         config, store = self.config, self.folder / "checkpoints"
+        fingerprint = workspace.fingerprints(self.folder)[0]
         begun = self._begun(console)
         done = begun.step if begun else 0
         dumped = debug.dumping(self.folder / debug.DUMPS, self.model)
@@ -95,7 +103,7 @@ class Training:
                 meta = {
                     "method": self.name,
                     "task": config.task,
-                    checkpoint.FINGERPRINT: self.belongs,
+                    checkpoint.FINGERPRINT: fingerprint,
                 }
                 log.sync()  # a checkpoint on the disk has its log there
                 path = checkpoint.save(store, step, state, meta, keep=config.keep)
@@ -129,7 +137,9 @@ class Training:
 
     def _begun(self, console: Console) -> "_Begun | None":
         """Where the training goes on: the newest valid checkpoint, if there is one."""
-        found = checkpoint.latest_valid(self.folder / "checkpoints", fingerprint=self.belongs)
+        found = checkpoint.latest_valid(
+            self.folder / "checkpoints", fingerprints=workspace.fingerprints(self.folder)
+        )
         if not found:
             return None
         step, path = found

@@ -18,7 +18,7 @@ import jax
 
 from palm_jax.envs import shifts
 from palm_jax.envs.registry import TASKS
-from palm_jax.train import checkpoint, methods, records
+from palm_jax.train import checkpoint, methods, pictures, records
 from palm_jax.train.config import AnyConfig, Config, ConfigError, Learning, command
 from palm_jax.train.evaluate import VIEW, Evaluator, Runners
 from palm_jax.train.learner import Learner, PolicyState, make_learner
@@ -40,6 +40,12 @@ _FREE = ("out", "resume", "data", "calibration", "sweep", "videos", "method")
 
 RECORDED = "recorded"
 """What config.json says under "kind" of a run on recordings; nothing of one in the simulator."""
+
+DIGESTS = "digests"
+"""Where config.json has the SHA-256 of the data that the run was begun with, by what they are."""
+
+DEMONSTRATIONS = "demonstrations"
+"""One of them."""
 
 _NOT_STORED = ("distributed",)
 """Fields of the machines alone: no run folder holds them."""
@@ -84,6 +90,7 @@ def begin_run(values: Mapping[str, Any], folder: Path, *, resume: bool) -> None:
       ConfigError: the folder holds another run, or holds one and `resume` was not asked for.
     """
     path, fresh = folder / "config.json", json.loads(json.dumps(values, default=str))
+    assert isinstance(fresh, dict)
     if path.exists():
         try:
             old = records.load_json(path)
@@ -96,6 +103,8 @@ def begin_run(values: Mapping[str, Any], folder: Path, *, resume: bool) -> None:
             raise ConfigError(
                 f"{folder} holds a run already: add --resume to go on, or choose another --out"
             )
+        if DIGESTS in old:
+            fresh[DIGESTS] = old[DIGESTS]  # compared when the data are opened: `bind_data`
         for name in sorted(set(old) | set(fresh)):
             if name not in _FREE and old.get(name) != fresh.get(name):
                 raise ConfigError(
@@ -105,16 +114,48 @@ def begin_run(values: Mapping[str, Any], folder: Path, *, resume: bool) -> None:
     write_json(path, fresh)
 
 
-def fingerprint(config: Config, method: str) -> str:
-    """Of all options that a run must keep: what its checkpoints are told by from others'."""
-    return fingerprint_of(stored(config, method))
+def bind_data(folder: Path, name: str, digest: str, path: Path | None) -> None:
+    """Notes in `config.json` what a run is trained on, or checks that it is the same as before.
+
+    Args:
+      folder: of the run.
+      name: what the data are.
+      digest: SHA-256 of them.
+      path: where they are, for the message.
+
+    Raises:
+      ConfigError: the run was begun with others.
+    """
+    values = records.load_json(folder / "config.json")
+    found = values.get(DIGESTS)
+    known = found if isinstance(found, dict) else {}
+    if known.get(name, digest) != digest:
+        raise ConfigError(
+            f"{folder} was begun with {name} of SHA-256 {str(known[name])[:12]}, but {path} has "
+            f"{digest[:12]}: resume with the old ones, or choose another --out"
+        )
+    if name not in known:
+        write_json(folder / "config.json", {**values, DIGESTS: {**known, name: digest}})
 
 
-def fingerprint_of(values: Mapping[str, Any]) -> str:
-    """`fingerprint` of what `config.json` holds."""
+def bind_backgrounds(folder: Path, config: Learning, method: methods.Method) -> None:
+    """`bind_data` for the user's own backgrounds, where the method has any use of them."""
+    if config.backgrounds is not None and method.augment:
+        digest = pictures.digest(config.backgrounds)
+        bind_data(folder, "backgrounds", digest, config.backgrounds)
+
+
+def fingerprints(folder: Path) -> tuple[str, ...]:
+    """What a run's checkpoints are told by from others': a hash of all that a run must keep, as
+    config.json has it. After the run's own comes that of one whose data were not noted."""
+    values = records.load_json(folder / "config.json")
     kept = {name: value for name, value in values.items() if name not in _FREE}
-    text = json.dumps({**kept, "method": values["method"]}, default=str, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+    kept["method"] = values.get("method")
+    old = {name: value for name, value in kept.items() if name != DIGESTS}
+    return tuple(
+        hashlib.sha256(json.dumps(each, sort_keys=True).encode()).hexdigest()
+        for each in (kept, old)
+    )
 
 
 def environment(config: Learning, *, wall_s: float) -> dict[str, Any]:
@@ -232,28 +273,26 @@ def load_policy(folder: Path, runners: Runners) -> tuple[Evaluator, PolicyState]
     """
     config = stored_config(folder)
     evaluator = make_evaluator(config, methods.find(config.method[0]), runners)
-    belongs = fingerprint(config, config.method[0])
-    return evaluator, best_policy(folder, evaluator.learner, belongs)
+    return evaluator, best_policy(folder, evaluator.learner)
 
 
-def best_policy(folder: Path, learner: Learner, belongs: str | None = None) -> PolicyState:
-    """Parameters of the best checkpoint in `folder/checkpoints`; of those of a `fingerprint`.
+def best_policy(folder: Path, learner: Learner) -> PolicyState:
+    """Parameters of the best checkpoint of a run.
 
     Raises:
       ConfigError: there is none.
     """
-    _, path = best_checkpoint(folder, belongs)
+    _, path = best_checkpoint(folder)
     return learner.policy_state(checkpoint.load(path, learner.abstract_state()))
 
 
-def best_checkpoint(folder: Path, belongs: str | None = None) -> tuple[int, Path]:
-    """(step, path) of the checkpoint in `folder/checkpoints` with the best in-domain success; of
-    those of a `fingerprint`.
+def best_checkpoint(folder: Path) -> tuple[int, Path]:
+    """(step, path) of the checkpoint of a run with the best in-domain success.
 
     Raises:
       ConfigError: there is none.
     """
-    best = checkpoint.best(folder / "checkpoints", fingerprint=belongs)
+    best = checkpoint.best(folder / "checkpoints", fingerprints=fingerprints(folder))
     if not best:
         raise ConfigError(f"{folder}/checkpoints holds no whole, scored checkpoint: train first")
     return best[0]

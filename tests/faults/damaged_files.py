@@ -130,7 +130,7 @@ def _damaged_checkpoint(folder: Path, harm: Callable[[Path], Any], reason: str |
     harm(store / "200")
     older, told = snapshot(store / "100"), _Told()
     with told:
-        found = checkpoint.latest_valid(store, fingerprint="mine")
+        found = checkpoint.latest_valid(store, fingerprints=["mine"])
     assert found == (100, store / "100") and snapshot(store / "100") == older
     loaded = checkpoint.load(found[1], TREE)
     assert loaded["w"].tobytes() == TREE["w"].tobytes() and int(loaded["step"]) == 100

@@ -365,8 +365,8 @@ def test_a_checkpoint_of_other_options_is_named_and_set_aside(tmp_path: Path) ->
     tree = {"x": np.ones(1)}
     checkpoint.save(tmp_path, 1, tree, {checkpoint.FINGERPRINT: "mine", "score": 0.1})
     checkpoint.save(tmp_path, 2, tree, {checkpoint.FINGERPRINT: "theirs", "score": 0.9})
-    assert checkpoint.best(tmp_path, fingerprint="mine") == [(1, tmp_path / "1")]
-    assert checkpoint.latest_valid(tmp_path, fingerprint="mine") == (1, tmp_path / "1")
+    assert checkpoint.best(tmp_path, fingerprints=["mine"]) == [(1, tmp_path / "1")]
+    assert checkpoint.latest_valid(tmp_path, fingerprints=["mine"]) == (1, tmp_path / "1")
     assert set_aside(tmp_path) == ["2-foreign"]
     checkpoint.save(tmp_path, 3, tree)  # from before there were fingerprints
-    assert checkpoint.latest_valid(tmp_path, fingerprint="mine") == (3, tmp_path / "3")
+    assert checkpoint.latest_valid(tmp_path, fingerprints=["mine"]) == (3, tmp_path / "3")

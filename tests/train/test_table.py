@@ -31,6 +31,7 @@ class Trainer:
         self.failing: set[str] = set()
         self.stop_at: str | None = None
         self.times = json.dumps(TIMES)
+        self.demonstrations: dict[str, str] = {}  # SHA-256 by task
         monkeypatch.setattr(table, "_train", self)
 
     def __call__(self, config: Config, log: Path) -> int:
@@ -50,6 +51,9 @@ class Trainer:
         }  # fmt: skip
         records.save_eval(config.out / "eval.npz", {"in_domain": episodes})
         (config.out / "times.json").write_text(self.times)
+        if config.task in self.demonstrations:
+            digests = {"demonstrations": self.demonstrations[config.task]}
+            (config.out / "config.json").write_text(json.dumps({"digests": digests}))
         return 0
 
 
@@ -176,6 +180,32 @@ def test_shards_are_merged(tmp_path: Path, trainer: Trainer) -> None:
     for task, method in every:
         counted = found[task][method]["0"]["in_domain"]["successes"]
         assert episodes[f"{task}/{method}/0/in_domain"].success.sum() == counted
+
+
+def test_cells_of_other_demonstrations_are_not_mixed(
+    tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither in a file, nor when files are merged."""
+    config = dataclasses.replace(SMALL, out=tmp_path / "one", seeds=(0,), methods=("palm",))
+    assert run(config) == 0  # by a version that did not note them
+    assert json.loads(config.file.read_text())["header"]["demonstrations"] == {}
+    trainer.demonstrations = {"lift_lid": "a" * 64, "lift_spam": "b" * 64}
+    assert run(dataclasses.replace(config, methods=("bc",))) == 0
+    header = json.loads(config.file.read_text())["header"]
+    assert header["demonstrations"] == trainer.demonstrations
+    before = config.file.read_bytes(), table_page.episodes_file(config.file).read_bytes()
+    trainer.demonstrations["lift_spam"] = "c" * 64
+    assert run(dataclasses.replace(config, tasks=("lift_spam",), methods=("arro",))) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "demonstrations of lift_spam with SHA-256 cccccccccccc" in error
+    assert "begun with bbbbbbbbbbbb" in error
+    other = dataclasses.replace(config, out=tmp_path / "two", methods=("arro",))
+    assert run(other) == 0
+    assert run(dataclasses.replace(config, merge=(other.file,))) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert f"{other.file}: demonstrations of lift_spam with SHA-256 cccccccccccc" in error
+    after = config.file.read_bytes(), table_page.episodes_file(config.file).read_bytes()
+    assert after == before
 
 
 def test_the_header_tells_the_speed(tmp_path: Path, trainer: Trainer) -> None:

@@ -3,16 +3,21 @@
 Worlds and pictures are replaced (`play`); the rest is the command's own code.
 """
 
+import json
 import os
+import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import play
 import pytest
+from faults import damaged_files
+from PIL import Image
 
-from palm_jax.train import checkpoint, metrics, records
+from palm_jax.train import checkpoint, demos, metrics, records, workspace
 from palm_jax.train.__main__ import main
 
 STEPS, EVERY = 12, 4
@@ -101,6 +106,86 @@ def test_a_kill_leaves_no_hole_in_the_log(
     command.killed(place, name, count)
     assert command() == 0
     play.assert_same(whole, command.out)
+
+
+def demonstrations(path: Path, seed: int) -> str:
+    """Writes other ones; returns the SHA-256 that the file has of itself."""
+    damaged_files.demonstrations(path)
+    with h5py.File(path, "r+") as file:
+        file["data/demo_0/actions"][0, 0] = seed
+        file["data"].attrs["sha256"] = demos._digest(file["data"])
+        return str(file["data"].attrs["sha256"])
+
+
+@pytest.mark.parametrize("step", ["5", None])
+def test_other_demonstrations_are_not_gone_on_with(
+    step: str | None, command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither by a training nor by a run that has nothing left to do; the same elsewhere are."""
+    command.told = lambda line: os.kill(os.getpid(), signal.SIGTERM) if line == step else None
+    assert command() == (130 if step else 0)
+    begun = json.loads((command.out / "config.json").read_text())["digests"]["demonstrations"]
+    with h5py.File(tmp_path / "demos.hdf5") as file:
+        assert file["data"].attrs["sha256"] == begun
+    other = demonstrations(tmp_path / "other.hdf5", 7)
+    before = play.tree(command.out / "checkpoints")
+    command.told = lambda line: None
+    capsys.readouterr()
+    assert command("--data", tmp_path / "other.hdf5") == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert f"demonstrations of SHA-256 {begun[:12]}, but {tmp_path}/other.hdf5" in error
+    assert other[:12] in error and "choose another --out" in error
+    assert play.tree(command.out / "checkpoints") == before
+    moved = shutil.move(tmp_path / "demos.hdf5", tmp_path / "moved.hdf5")
+    assert command("--data", moved) == 0
+
+
+def test_other_pictures_behind_the_same_name_are_not_gone_on_with(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for number in range(2):
+        colour = (9 * number, 0, 0)
+        Image.new("RGB", (8, 8), colour).save(folder / f"{number}.png")
+    assert command("--backgrounds", folder) == 0
+    (folder / "notes.txt").write_text("no picture")
+    assert command("--backgrounds", folder) == 0
+    Image.new("RGB", (8, 8), (9, 0, 1)).save(folder / "1.png")
+    assert command("--backgrounds", folder) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "was begun with backgrounds of SHA-256" in error and str(folder) in error
+
+
+def test_a_run_from_before_data_were_noted_goes_on(
+    command: Command, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its checkpoints are its own, and its data are noted from now on."""
+    command.told = lambda line: os.kill(os.getpid(), signal.SIGTERM) if line == "9" else None
+    with monkeypatch.context() as before:
+        before.setattr(workspace, "bind_data", lambda *_: None)
+        assert command() == 130
+    values = json.loads((command.out / "config.json").read_text())
+    assert "digests" not in values
+    command.told = lambda line: None
+    assert command() == 0
+    play.assert_same(whole, command.out)
+    assert not (command.out / "checkpoints" / "damaged").exists()
+    assert json.loads((command.out / "config.json").read_text())["digests"]
+    assert [step for step, _ in checkpoint.best(command.out / "checkpoints", count=9)] == [
+        step for step, _ in checkpoint.best(whole / "checkpoints", count=9)
+    ]
+
+
+def test_checkpoints_of_other_data_are_set_aside(command: Command, tmp_path: Path) -> None:
+    """Also if config.json, which would have told, is away."""
+    assert command() == 0
+    for name in ("config.json", "eval.json"):
+        (command.out / name).unlink()
+    demonstrations(tmp_path / "demos.hdf5", 7)
+    assert command() == 0
+    aside = command.out / "checkpoints" / "damaged"
+    assert {path.name for path in aside.iterdir()} == {"4-foreign", "8-foreign", "12-foreign"}
 
 
 def test_a_checkpoint_on_the_disk_has_its_log_there(command: Command) -> None:
