@@ -348,12 +348,19 @@ def check_counts(path: Path, episodes: Mapping[str, DomainRecord]) -> None:
     Raises:
       RecordError: they differ; the domain is named.
     """
-    stored, counted = load_counts(path), counts(episodes)
+    compare_counts(path, load_counts(path), episodes)
+
+
+def compare_counts(
+    where: object, stored: Mapping[str, Mapping[str, int]], episodes: Mapping[str, DomainRecord]
+) -> None:
+    """`check_counts` of counts that were read; `where` names them."""
+    counted = counts(episodes)
     for domain in {**stored, **counted}:
         if stored.get(domain) != counted.get(domain):
             raise RecordError(
-                f"{path}: {domain}: {stored.get(domain)}, but the episodes in the .npz file beside "
-                f"it count {counted.get(domain)}"
+                f"{where}: {domain}: {stored.get(domain)}, but the episodes in the .npz file "
+                f"beside it count {counted.get(domain)}"
             )
 
 

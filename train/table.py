@@ -252,7 +252,7 @@ def run(config: TableConfig, console: Console) -> Path:
     """Runs what is missing; returns the file.
 
     Raises:
-      ConfigError: see `cells` and `read`.
+      ConfigError: see `cells`, `read` and `_merge`.
       KeyboardInterrupt: the running cell was stopped; it resumes from its last checkpoint.
     """
     asked, fresh = cells(config), header(config)
@@ -440,22 +440,52 @@ def _environment(folder: Path) -> dict[str, str]:
     return {**ours, **os.environ}
 
 
-def _merge(table: dict[str, Any], path: Path, fresh: dict[str, Any]) -> list[Cell]:
-    """Takes over what only the other file has; returns the cells that came with results."""
-    other, taken = read(path, fresh), []
+def _merge(
+    table: dict[str, Any], path: Path, fresh: dict[str, Any]
+) -> dict[Cell, Mapping[str, records.DomainRecord]]:
+    """Takes over what only the other file has; returns the episodes of the cells that came with
+    results.
+
+    Raises:
+      ConfigError: there is no such file, or one of other conditions.
+      RecordError: a cell's episodes are missing, or others than its counts say.
+    """
+    if not path.exists():
+        raise ConfigError(
+            f"merge: expected the JSON file of a shard, got {path}, which is not there"
+        )
+    other, beside = read(path, fresh), _episodes_of(path)
+    taken: dict[Cell, Mapping[str, records.DomainRecord]] = {}
     demonstrations = other["header"].get(workspace.DEMONSTRATIONS, {})
     _note_demonstrations(table["header"], demonstrations, path)
     for cell in _cells_of(other, "results"):
         if _get(table, "results", cell) is None:
-            _put(table, "results", cell, _get(other, "results", cell))
+            counts = _get(other, "results", cell)
+            records.compare_counts(f"{path}: {cell.name}", counts, beside.get(cell, {}))
+            _put(table, "results", cell, counts)
             _put(table, "times", cell, _get(other, "times", cell) or {})
             _drop(table, "failed", cell)
-            taken.append(cell)
+            taken[cell] = beside.get(cell, {})
     for cell in _cells_of(other, "failed"):
         if _get(table, "results", cell) is None:
             _put(table, "failed", cell, _get(other, "failed", cell))
     _note_origin(table["header"], other["header"])
     return taken
+
+
+def _episodes_of(table: Path) -> dict[Cell, dict[str, records.DomainRecord]]:
+    """The episodes beside a table, by cell and domain; empty where there is no such file."""
+    path = table_page.episodes_file(table)
+    found: dict[Cell, dict[str, records.DomainRecord]] = {}
+    for name, record in (records.load_eval(path) if path.exists() else {}).items():
+        try:
+            task, method, seed, domain = name.split("/")
+            found.setdefault(Cell(task, method, int(seed)), {})[domain] = record
+        except ValueError as error:
+            raise records.RecordError(
+                f"{path}: expected arrays named TASK/METHOD/SEED/DOMAIN/..., got {name!r}"
+            ) from error
+    return found
 
 
 def _note_origin(header: dict[str, Any], other: dict[str, Any]) -> None:
@@ -466,15 +496,11 @@ def _note_origin(header: dict[str, Any], other: dict[str, Any]) -> None:
 
 
 def _merge_all(config: TableConfig, table: dict[str, Any], fresh: dict[str, Any]) -> None:
+    taken: dict[Cell, Mapping[str, records.DomainRecord]] = {}
     for path in config.merge:
-        taken = _merge(table, path, fresh)
-        episodes: dict[Cell, dict[str, records.DomainRecord]] = {}
-        beside = table_page.episodes_file(path)
-        for name, record in (records.load_eval(beside) if beside.exists() else {}).items():
-            task, method, seed, domain = name.split("/")
-            episodes.setdefault(Cell(task, method, int(seed)), {})[domain] = record
-        _keep_episodes(config.file, {cell: episodes[cell] for cell in taken if cell in episodes})
+        taken |= _merge(table, path, fresh)
     _note_speed(table)
+    _keep_episodes(config.file, taken)
     _store(config.file, table)
 
 

@@ -182,6 +182,42 @@ def test_shards_are_merged(tmp_path: Path, trainer: Trainer) -> None:
         assert episodes[f"{task}/{method}/0/in_domain"].success.sum() == counted
 
 
+def test_what_cannot_be_merged_is_named_and_changes_nothing(
+    tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = (
+        dataclasses.replace(SMALL, out=tmp_path / name, seeds=(0,), methods=(name,))
+        for name in ("palm", "bc")
+    )
+    assert run(first) == run(second) == 0
+    beside = table_page.episodes_file(second.file)
+    whole = beside.read_bytes()
+    before = first.file.read_bytes(), table_page.episodes_file(first.file).read_bytes()
+
+    def refused(*paths: Path) -> str:
+        assert run(dataclasses.replace(first, merge=paths)) == 2
+        after = first.file.read_bytes(), table_page.episodes_file(first.file).read_bytes()
+        assert after == before
+        return " ".join(capsys.readouterr().err.split())
+
+    wrong = tmp_path / "wrong" / "table.json"
+    assert f"expected the JSON file of a shard, got {wrong}" in refused(second.file, wrong)
+    with np.load(beside) as file:
+        arrays = dict(file)
+    some = {name: array for name, array in arrays.items() if not name.startswith("lift_spam")}
+    np.savez(beside, **some)
+    error = refused(second.file)
+    assert f"{second.file}: lift_spam/bc-s0: in_domain" in error and "count None" in error
+    name = "lift_spam/bc/0/in_domain/success"
+    np.savez(beside, **arrays | {name: ~arrays[name]})
+    assert "lift_spam/bc-s0: in_domain: {'successes': 4" in refused(second.file)
+    beside.unlink()
+    assert f"{second.file}: lift_lid/bc-s0" in refused(second.file)
+    beside.write_bytes(whole)
+    assert run(dataclasses.replace(first, merge=(second.file,))) == 0
+    assert len(records.load_eval(table_page.episodes_file(first.file))) == 4
+
+
 def test_cells_of_other_demonstrations_are_not_mixed(
     tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture[str]
 ) -> None:
