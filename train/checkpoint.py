@@ -21,12 +21,10 @@ that a checkpoint depends on no class of Flax or Optax; the target of `load` giv
 
 import contextlib
 import hashlib
-import importlib.metadata
 import json
 import logging
 import math
 import os
-import platform
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
@@ -38,6 +36,7 @@ import numpy as np
 import orbax.checkpoint as orbax
 from orbax.checkpoint import v1 as ocp
 
+from palm_jax.train import versions
 from palm_jax.train.metrics import fsync_folder, plain, write_atomic
 
 FORMAT = "palm_jax.checkpoint"
@@ -154,7 +153,7 @@ def save(
             "step": int(step),
             "files": _hash_files(temporary),
             "leaves": {name: _describe(leaf) for name, leaf in named.items()},
-            "versions": _versions(),
+            "versions": versions.current(),
             "meta": plain(meta or {}),
         }
         _write_manifest(temporary, manifest)
@@ -232,16 +231,6 @@ def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     content = {name: value for name, value in manifest.items() if name != "checksum"}
     content["checksum"] = _digest(content)
     write_atomic(folder / MANIFEST, (json.dumps(content, indent=1) + "\n").encode())
-
-
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for name in ("palm-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy"):
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:  # a checkout that was not installed
-            found[name] = "unknown"
-    return found
 
 
 def _remove(path: Path) -> None:
@@ -487,6 +476,11 @@ def read_meta(path: str | Path) -> dict[str, Any]:
       DamagedCheckpoint: the manifest is missing or damaged.
     """
     return _read_manifest(Path(path))["meta"]
+
+
+def versions_of(path: str | Path) -> Any:
+    """What a checkpoint says of the versions that wrote it."""
+    return _read_manifest(Path(path)).get("versions")
 
 
 def content_hash(path: str | Path) -> str:

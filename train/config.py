@@ -33,6 +33,7 @@ class Learning:
       seed: of training. Demonstrations and evaluation scenes have seeds of their own.
       out: the run folder; by default one in runs/ that is named after the main options.
       resume: go on with the run in `out`.
+      other_versions: also where packages have other versions than when it was begun.
       data: demonstrations to use (made if the file does not exist); by default inside `out`. With
         --calibration: recordings of any robot, a robomimic file or a LeRobot folder.
       image_size: side of the policy's image in pixels, before the random crop.
@@ -61,6 +62,7 @@ class Learning:
     seed: int = 0
     out: Path | None = None
     resume: bool = False
+    other_versions: bool = False
     data: Path | None = None
     image_size: int = 64
     random_crop: int = 58

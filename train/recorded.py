@@ -156,9 +156,7 @@ def _execute(config: Recorded, recording: Recording, out: Path, console: Console
     terminal.header(console, "palm_jax", _header(config, recording, survey, split, out))
     found = {}
     for each in jobs:
-        began = time.monotonic()
-        found[each.method.name] = each.perform(facts, console)
-        _note_environment(config, each.folder, time.monotonic() - began)
+        found[each.method.name] = each.perform(console)
     _picture(jobs, out)
     report.write_report(out)
     terminal.held_out(console, {name: entry for name, entry in found.items() if entry})
@@ -211,12 +209,6 @@ def _distances(recording: Recording, episode: str) -> np.ndarray:
     return np.linalg.norm(recording.trajectory(episode).tcp[:, :3, 3] - camera, axis=1)
 
 
-def _note_environment(config: Recorded, folder: Path, wall_s: float) -> None:
-    path = folder / "env.json"
-    earlier = records.seconds(records.load_notes(path), "wall_s") or 0.0
-    write_json(path, workspace.environment(config, wall_s=earlier + wall_s))
-
-
 # ------------------------------------------------------------------------------------- one method
 
 
@@ -236,12 +228,11 @@ class _Job:
         config = dataclasses.replace(
             self.config, task=self.config.task or str(facts["recorded_task"])
         )
-        fields = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
         spec = dataclasses.asdict(self.spec)
         values: dict[str, Any] = plain(
             {
                 "kind": workspace.RECORDED,
-                **fields,
+                **workspace.options(config),
                 "method": self.method.name,
                 **facts,
                 "spec": spec,
@@ -249,7 +240,7 @@ class _Job:
         )
         return values
 
-    def perform(self, facts: Mapping[str, Any], console: Console) -> dict[str, Any]:
+    def perform(self, console: Console) -> dict[str, Any]:
         """Trains, and tells how good the chosen checkpoint is on what was held out; empty if
         nothing was."""
         name = self.method.name
@@ -257,6 +248,14 @@ class _Job:
         if path.exists():
             console.print(f"{name}: trained already")
             return records.load_json(path)
+        with workspace.session(self.config, self.folder):
+            step, found = self._train(console)
+        # Written last: its presence says that the method is finished.
+        write_json(path, {"step": step, "episodes": len(self.split.held_out), **found})
+        return found
+
+    def _train(self, console: Console) -> tuple[int, dict[str, Any]]:
+        """The step of the checkpoint that was chosen, and how good it is."""
         model = learner.make_learner(
             self.config.learner(self.method), self.spec.proprio_size, (VIEW,)
         )
@@ -267,9 +266,7 @@ class _Job:
                 policy = model.policy_state(checkpoint.load(best, model.abstract_state()))
                 found = held_out.measure(model, policy, checked) if len(checked.proprio) else {}
             self._note_views(data)
-        # Written last: its presence says that the method is finished.
-        write_json(path, {"step": step, "episodes": len(self.split.held_out), **found})
-        return found
+        return step, found
 
     def _training(self, model: learner.Learner, checked: learner.Batch) -> training.Training:
         def score(step: int, state: learner.TrainState) -> training.Score:

@@ -102,11 +102,9 @@ def _execute(config: Config, out: Path, console: Console) -> Path:
     devices.wait()  # the others read what is written now
     _agree_on_data(config, data)
     for name, folder in folders.items():
-        began = time.monotonic()
         _one_method(config, evaluators[name], data, folder, console)
-        _note_environment(config, folder, time.monotonic() - began, runners.worlds)
     if config.sweep:
-        _sweeps(evaluators, folders, console)
+        _sweeps(evaluators, folders, console, other_versions=config.other_versions)
     _gallery(folders, out, console)
     report.write_report(out)
     counts = {name: records.load_counts(folder / "eval.json") for name, folder in folders.items()}
@@ -180,15 +178,6 @@ def _worlds(config: Config) -> int:
     return config.scenes if config.scenes <= limit else limit // 2
 
 
-def _note_environment(
-    config: Config, folder: Path, wall_s: float, worlds: Mapping[str, int]
-) -> None:
-    path = folder / "env.json"
-    earlier = records.seconds(records.load_notes(path), "wall_s") or 0.0
-    found = workspace.environment(config, wall_s=earlier + wall_s)
-    write_json(path, {**found, "worlds": dict(worlds)})
-
-
 def _demonstration_file(config: Config) -> Path:
     assert config.out is not None
     return config.data or config.out / "demos" / f"{config.task}-{config.robot}.hdf5"
@@ -241,9 +230,11 @@ def _one_method(
     if devices.from_first(_finished(folder, console)):
         console.print(f"{method.name}: trained and evaluated already")
         return
-    _training(config, evaluator, folder).train(_samples(config, evaluator, data), console)
-    with training.timed(folder, "evaluation_s"):
-        _evaluate(config, evaluator, folder, console)
+    with workspace.session(config, folder) as notes:
+        _training(config, evaluator, folder).train(_samples(config, evaluator, data), console)
+        with training.timed(folder, "evaluation_s"):
+            _evaluate(config, evaluator, folder, console)
+        notes["worlds"] = dict(evaluator.runners.worlds)
 
 
 def _samples(config: Config, evaluator: Evaluator, data: demos.Demos) -> learner.Batch:
@@ -383,13 +374,19 @@ def _film_domain(
             videos.write_video(folder / "videos" / name, frames)
 
 
-def _sweeps(evaluators: dict[str, Evaluator], folders: dict[str, Path], console: Console) -> None:
+def _sweeps(
+    evaluators: dict[str, Evaluator],
+    folders: dict[str, Path],
+    console: Console,
+    *,
+    other_versions: bool,
+) -> None:
     """A coarse sweep of every policy; `python -m palm_jax sweep RUN` makes finer ones."""
     options = sweep.SweepConfig(run=Path(), camera="-30:30:3")
     job = sweep.job(options)
     for name, folder in folders.items():
-        path = records.sweep_path(folder)
-        if path.exists():
+        path, header = records.sweep_path(folder), sweep.header_of(options, folder)
+        if path.exists() and sweep.is_of(path, header):
             continue
         evaluator = evaluators[name]
         with terminal.ProgressBar(console, job.episodes, f"sweep {name}", unit="episode") as bar:
@@ -397,9 +394,11 @@ def _sweeps(evaluators: dict[str, Evaluator], folders: dict[str, Path], console:
                 path,
                 evaluator,
                 workspace.best_policy(folder, evaluator.learner),
+                header=header,
                 seed=options.seed,
-                aligned=workspace.quoted_variant(folder) == "aligned",
+                aligned=header["aligned"],
                 progress=bar.advance,
+                other_versions=other_versions,
             )
 
 

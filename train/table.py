@@ -33,7 +33,15 @@ from palm_jax.envs.registry import TASKS
 from palm_jax.envs.shifts import DOMAINS
 from palm_jax.train import config as configuration
 from palm_jax.train import console as terminal
-from palm_jax.train import interrupts, locks, methods, records, table_page, workspace
+from palm_jax.train import (
+    interrupts,
+    locks,
+    methods,
+    records,
+    table_page,
+    versions,
+    workspace,
+)
 from palm_jax.train.config import Config, ConfigError
 from palm_jax.train.metrics import plain, write_json
 
@@ -168,7 +176,7 @@ def cell_config(config: TableConfig, cell: Cell) -> Config:
 def header(config: TableConfig) -> dict[str, Any]:
     """The conditions under which the cells of a file were made."""
     preset = configuration.PRESETS[config.preset]()
-    found = workspace.environment(preset, wall_s=0.0)
+    found = workspace.environment(preset)
     recipe = {name: getattr(preset, name) for name in _KEPT} | {"other_robot": preset.second_robot}
     return {
         "preset": config.preset,
@@ -310,6 +318,7 @@ def _whole(folder: Path, console: Console) -> bool:
 def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
     """What a finished cell left in its folder, into the table and the file beside it."""
     folder = config.folder / cell.name
+    _check_versions(table["header"], folder)
     _note_demonstrations(table["header"], {cell.task: _trained_on(folder)}, folder)
     _keep_episodes(config.file, {cell: records.load_eval(folder / "eval.npz")})
     _put(table, "results", cell, records.load_counts(folder / "eval.json"))
@@ -318,6 +327,19 @@ def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
     if _took(times):
         _put(table, "times", cell, times)
     _note_speed(table)
+
+
+def _check_versions(header: Mapping[str, Any], folder: Path) -> None:
+    """Raises ConfigError for a cell that was worked on under other versions than the table's."""
+    path = folder / "env.json"
+    for entry in records.load_sessions(path) if path.exists() else []:
+        if found := versions.difference(entry.get("versions"), header["versions"]):
+            name, old, new = found
+            raise ConfigError(
+                f"{folder} was made with {name} {old}, the table with {new}: results of two kinds "
+                "are not mixed. Move the folder away to run the cell again, or choose another "
+                "--json and --out"
+            )
 
 
 def _trained_on(folder: Path) -> str | None:

@@ -76,6 +76,7 @@ class Training:
         """Trains from the newest valid checkpoint, or from the start, to the last step.
 
         Raises:
+          ConfigError: begun under other versions.
           Interrupted: stopped on request.
           NonFiniteError: see `learner.run`; the message names a dump.
         """
@@ -136,13 +137,23 @@ class Training:
             raise Interrupted
 
     def _begun(self, console: Console) -> "_Begun | None":
-        """Where the training goes on: the newest valid checkpoint, if there is one."""
+        """Where the training goes on: the newest valid checkpoint, if there is one.
+
+        Raises:
+          ConfigError: it was written under other versions.
+        """
         found = checkpoint.latest_valid(
             self.folder / "checkpoints", fingerprints=workspace.fingerprints(self.folder)
         )
         if not found:
             return None
         step, path = found
+        workspace.check_versions(
+            path,
+            checkpoint.versions_of(path),
+            allowed=self.config.other_versions,
+            instead="choose another --out",
+        )
         state = checkpoint.load(path, self.model.abstract_state())
         if step < self.config.steps:
             terminal.resumed(console, f"{self.name}, step {step} of {self.config.steps}")

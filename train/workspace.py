@@ -9,8 +9,9 @@ import platform
 import shlex
 import subprocess
 import tempfile
-from collections.abc import Mapping
-from importlib import metadata
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -18,23 +19,12 @@ import jax
 
 from palm_jax.envs import shifts
 from palm_jax.envs.registry import TASKS
-from palm_jax.train import checkpoint, methods, pictures, records
+from palm_jax.train import checkpoint, methods, pictures, records, versions
 from palm_jax.train.config import AnyConfig, Config, ConfigError, Learning, command
 from palm_jax.train.evaluate import VIEW, Evaluator, Runners
 from palm_jax.train.learner import Learner, PolicyState, make_learner
 from palm_jax.train.metrics import write_json
 
-_PACKAGES = (
-    "palm_jax",
-    "jax",
-    "jaxlib",
-    "flax",
-    "optax",
-    "orbax-checkpoint",
-    "mujoco",
-    "mujoco-mjx",
-    "numpy",
-)
 _FREE = ("out", "resume", "data", "calibration", "sweep", "videos", "method")
 """Fields in which a resumed command may differ from the one that began."""
 
@@ -47,14 +37,21 @@ DIGESTS = "digests"
 DEMONSTRATIONS = "demonstrations"
 """One of them."""
 
-_NOT_STORED = ("distributed",)
-"""Fields of the machines alone: no run folder holds them."""
+_NOT_STORED = ("distributed", "other_versions")
+"""Fields of one session alone: no run folder holds them."""
+
+
+def options(config: Learning) -> dict[str, Any]:
+    """Those of a command that a run folder holds."""
+    return {name: getattr(config, name) for name in _stored_names(type(config))}
+
+
+def _stored_names(kind: type[Learning]) -> list[str]:
+    return [f.name for f in dataclasses.fields(kind) if f.name not in _NOT_STORED]
 
 
 def stored(config: Config, method: str) -> dict[str, Any]:
     """What `config.json` of one method's run folder holds."""
-    names = [f.name for f in dataclasses.fields(Config) if f.name not in _NOT_STORED]
-    values = {name: getattr(config, name) for name in names}
     low, high = shifts.TEST_LOW, shifts.TEST_HIGH
     regions = {
         "train_x": (0.15, 0.35),
@@ -64,7 +61,7 @@ def stored(config: Config, method: str) -> dict[str, Any]:
         "test_angle": shifts.MAX_CAMERA_ANGLE,
     }
     return {
-        **values,
+        **options(config),
         "other_robot": config.second_robot,
         "method": method,
         "frame": f"{methods.find(method).frame} px",
@@ -158,32 +155,58 @@ def fingerprints(folder: Path) -> tuple[str, ...]:
     )
 
 
-def environment(config: Learning, *, wall_s: float) -> dict[str, Any]:
-    """What `env.json` holds: where, when and with what."""
+@contextmanager
+def session(config: Learning, folder: Path) -> Iterator[dict[str, Any]]:
+    """Around work in a run folder: adds an entry to `env.json` that says where, when and with what.
+
+    Yields the entry; what is put into it is noted at the end. One without `wall_s` is of a process
+    that was killed.
+    """
+    path, start = folder / "env.json", time.monotonic()
+    try:
+        earlier = records.load_sessions(path) if path.exists() else []
+    except records.RecordError:
+        earlier = []  # no result rests on it
+    now = environment(config)
+    write_json(path, {"sessions": [*earlier, now]})
+    try:
+        yield now
+    finally:
+        now["wall_s"] = round(time.monotonic() - start, 1)
+        write_json(path, {"sessions": [*earlier, now]})
+
+
+def check_versions(where: object, noted: Any, *, allowed: bool, instead: str) -> None:
+    """What was begun under other versions is not gone on with, unless that is `allowed`.
+
+    Args:
+      where: what was begun.
+      noted: what it says of its versions.
+      instead: what else can be done.
+
+    Raises:
+      ConfigError: the first package that differs is named.
+    """
+    found = None if allowed else versions.difference(noted, versions.current())
+    if found:
+        name, old, new = found
+        raise ConfigError(
+            f"{where} was begun with {name} {old}, now it is {new}: install the old version, "
+            f"{instead}, or go on with --other-versions, which env.json or the header then tells"
+        )
+
+
+def environment(config: Learning) -> dict[str, Any]:
+    """An entry of `env.json`."""
     return {
         "command": shlex.join(command(config)),
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}",
         "devices": [str(device) for device in jax.devices()],
-        "versions": versions(),
+        "versions": versions.current(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
         "commit": _commit(),
-        "wall_s": round(wall_s, 1),
     }
-
-
-def versions() -> dict[str, str]:
-    """Those of Python and of the packages that decide what comes out."""
-    found = {name: metadata.version(name) for name in _PACKAGES if _installed(name)}
-    return found | {"python": platform.python_version()}
-
-
-def _installed(name: str) -> bool:
-    try:
-        metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return False
-    return True
 
 
 def _processor() -> str:
@@ -245,7 +268,7 @@ def stored_config(folder: Path) -> Config:
 def config_in(folder: Path, kind: type[AnyConfig]) -> AnyConfig:
     """What `config.json` holds, as the command saw it."""
     values = records.load_json(folder / "config.json")
-    names = [f.name for f in dataclasses.fields(kind) if f.name not in _NOT_STORED]
+    names = _stored_names(kind)
     missing = sorted(set(names) - set(values))
     if missing:
         raise ConfigError(f"{folder}/config.json lacks {', '.join(missing)}: another version's run")

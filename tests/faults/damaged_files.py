@@ -275,7 +275,7 @@ def _damaged_sweep(folder: Path, shift: str, harm: Callable[[Path], Any]) -> Out
     path = records.sweep_path(folder, shift=shift)
     if shift:
         curve = records.StrengthSweep(shift, np.arange(2.0), cells[:, 0, 0], cells[:, 0, 0])
-        records.save_strengths(path, curve)
+        records.save_sweep(path, curve)
     else:
         records.save_sweep(
             path, records.Sweep(np.arange(2.0), np.ones(1), np.ones(1), cells, cells)

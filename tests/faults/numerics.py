@@ -84,7 +84,7 @@ def _too_many_in_a_sweep(folder: Path) -> Outcome:
     for fits in (16, 3):
         runner, _ = rooms.evaluator(16, fits=fits)
         path = folder / f"{fits}.npz"
-        job.perform(path, runner, POLICY, seed=0, aligned=True)
+        job.perform(path, runner, POLICY, header={}, seed=0, aligned=True)
         found.append(records.load_sweep(path))
     np.testing.assert_array_equal(found[0].success, found[1].success)
     assert [sweep.worlds for sweep in found] == [16, 2]

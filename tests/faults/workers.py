@@ -106,6 +106,7 @@ def run_sweep(folder: Path) -> None:
         folder / "sweep.npz",
         runner,
         policy,
+        header={},
         seed=0,
         aligned=True,
         progress=lambda count: _tell(folder, str(count)),

@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 import time
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ class Trainer:
         self.failing: set[str] = set()
         self.stop_at: str | None = None
         self.times = json.dumps(TIMES)
+        self.env: object = {}
         self.demonstrations: dict[str, str] = {}  # SHA-256 by task
         monkeypatch.setattr(table, "_train", self)
 
@@ -51,6 +53,7 @@ class Trainer:
         }  # fmt: skip
         records.save_eval(config.out / "eval.npz", {"in_domain": episodes})
         (config.out / "times.json").write_text(self.times)
+        (config.out / "env.json").write_text(json.dumps(self.env))
         if config.task in self.demonstrations:
             digests = {"demonstrations": self.demonstrations[config.task]}
             (config.out / "config.json").write_text(json.dumps({"digests": digests}))
@@ -242,6 +245,22 @@ def test_cells_of_other_demonstrations_are_not_mixed(
     assert f"{other.file}: demonstrations of lift_spam with SHA-256 cccccccccccc" in error
     after = config.file.read_bytes(), table_page.episodes_file(config.file).read_bytes()
     assert after == before
+
+
+@pytest.mark.parametrize("kind", ["one of the sessions", "the only one"])
+def test_a_cell_of_other_versions_is_not_entered(
+    kind: str, tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was made before an upgrade, and taken from its folder after it."""
+    config = dataclasses.replace(SMALL, out=tmp_path, seeds=(0,), methods=("palm",))
+    here = metadata.version("jax")
+    old, now = {"versions": {"jax": "0.0.1"}}, {"versions": {"jax": here}}
+    trainer.env = {"sessions": [old, now]} if kind == "one of the sessions" else old
+    assert run(config) == 2 and not config.file.exists()
+    error = " ".join(capsys.readouterr().err.split())
+    assert f"lift_lid/palm-s0 was made with jax 0.0.1, the table with {here}" in error
+    trainer.env = {"sessions": [now, now]}
+    assert run(config) == 0
 
 
 def test_the_header_tells_the_speed(tmp_path: Path, trainer: Trainer) -> None:

@@ -3,21 +3,32 @@
 Worlds and pictures are replaced (`play`); the rest is the command's own code.
 """
 
+import contextlib
 import json
 import os
 import shutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import play
 import pytest
 from faults import damaged_files
 from PIL import Image
 
-from palm_jax.train import checkpoint, demos, metrics, records, workspace
+from palm_jax.train import (
+    checkpoint,
+    demos,
+    locks,
+    metrics,
+    records,
+    sweep,
+    versions,
+    workspace,
+)
 from palm_jax.train.__main__ import main
 
 STEPS, EVERY = 12, 4
@@ -186,6 +197,126 @@ def test_checkpoints_of_other_data_are_set_aside(command: Command, tmp_path: Pat
     assert command() == 0
     aside = command.out / "checkpoints" / "damaged"
     assert {path.name for path in aside.iterdir()} == {"4-foreign", "8-foreign", "12-foreign"}
+
+
+def sessions(folder: Path) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = json.loads((folder / "env.json").read_text())["sessions"]
+    return found
+
+
+def other_jax(patch: pytest.MonkeyPatch) -> str:
+    """Pretends that another JAX is installed; returns the version of the right one."""
+    real = versions.current()
+    patch.setattr(versions, "current", lambda: {**real, "jax": "0.0.1"})
+    return real["jax"]
+
+
+@pytest.mark.parametrize("noted", ["now", "before"])
+def test_other_versions_do_not_go_on_unless_they_are_told_to(
+    noted: str, command: Command, whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command.told = lambda line: os.kill(os.getpid(), signal.SIGTERM) if line == "9" else None
+    assert command() == 130
+    first = sessions(command.out)
+    if noted == "before":  # env.json told of the last session alone
+        (command.out / "env.json").write_text(json.dumps(first[0]))
+    jax_version = other_jax(command.patch)
+    before = play.tree(command.out / "checkpoints")
+    command.told = lambda line: None
+    capsys.readouterr()
+    assert command() == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert f"checkpoints/9 was begun with jax {jax_version}, now it is 0.0.1" in error
+    assert "--other-versions" in error and play.tree(command.out / "checkpoints") == before
+    assert command("--other-versions") == 0
+    play.assert_same(whole, command.out)
+    found = sessions(command.out)
+    assert [entry["versions"]["jax"] for entry in found] == [jax_version, "0.0.1", "0.0.1"]
+    assert found[:1] == first and "--other-versions" in found[2]["command"]
+    assert all(entry["wall_s"] >= 0 for entry in found) and found[2]["worlds"] == {"panda": 1}
+    assert "other_versions" not in json.loads((command.out / "config.json").read_text())
+
+
+def test_a_finished_run_is_not_said_to_be_made_by_who_looks_at_it(command: Command) -> None:
+    assert command() == 0
+    before = (command.out / "env.json").read_bytes()
+    other_jax(command.patch)
+    assert command() == 0
+    assert (command.out / "env.json").read_bytes() == before
+
+
+class Swept:
+    """Stands in for a sweep of one cell."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def __call__(self, *_: Any, angles: Any, xs: Any, ys: Any, episodes: int, **__: Any) -> Any:
+        self.count += 1
+        cells = np.zeros((len(angles), len(xs), len(ys), episodes), bool)
+        return records.Sweep(angles, xs, ys, cells, cells)
+
+
+@pytest.fixture
+def swept(command: Command) -> Swept:
+    found = Swept()
+    command.patch.setattr(sweep, "sweep", found)
+    command.patch.setattr(sweep.report, "main", lambda words: 0)
+    return found
+
+
+def policy_of(path: Path) -> str:
+    """As a sweep's file tells it."""
+    with np.load(path, allow_pickle=False) as file:
+        return str(json.loads(str(file["header"]))["policy"])
+
+
+def test_a_sweep_says_of_which_policy_it_is(
+    command: Command, swept: Swept, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One of an earlier policy is made again, by the command and after a training."""
+    words = [str(command.out), "--camera", "0", "--workspace", "1x1"]
+    path = command.out / "sweep.npz"
+    command.told = lambda line: os.kill(os.getpid(), signal.SIGTERM) if line == "9" else None
+    assert command() == 130
+    assert sweep.main(words) == 2 and swept.count == 0
+    assert "expected a finished run" in " ".join(capsys.readouterr().out.split())
+    command.told = lambda line: None
+    assert command() == 0
+    assert sweep.main(words) == 0 and sweep.main(words) == 0 and swept.count == 1
+    assert "swept already" in capsys.readouterr().out
+    scores = play.scores(command.out)
+    best, worst = (f(scores, key=scores.__getitem__) for f in (max, min))
+    store = command.out / "checkpoints"
+    assert policy_of(path) == checkpoint.content_hash(store / str(best))
+    for number, again in enumerate((lambda: sweep.main(words), lambda: command("--sweep"))):
+        better = (worst, best)[number]
+        checkpoint.update_meta(store / str(better), score=2.0 + number)
+        assert again() == 0 and again() == 0
+        assert swept.count == 2 + number
+        assert policy_of(path) == checkpoint.content_hash(store / str(better))
+    # From before there were headers: it is what it was taken for.
+    records.save_sweep(path, records.load_sweep(path))
+    assert sweep.main(words) == 0 and swept.count == 3
+
+
+def test_what_another_process_has_swept_meanwhile_is_not_swept_again(
+    command: Command, swept: Swept
+) -> None:
+    assert command() == 0
+    words = [str(command.out), "--camera", "0", "--workspace", "1x1"]
+    assert sweep.main(words) == 0 and swept.count == 1
+    path = command.out / "sweep.npz"
+    content = path.read_bytes()
+    path.unlink()
+
+    @contextlib.contextmanager
+    def claim(*_: Any, **__: Any) -> Iterator[None]:
+        path.write_bytes(content)  # by the process that had the claim until now
+        yield
+
+    command.patch.setattr(locks, "claim", claim)
+    assert sweep.main(words) == 0 and swept.count == 1
 
 
 def test_a_checkpoint_on_the_disk_has_its_log_there(command: Command) -> None:
