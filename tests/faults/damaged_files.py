@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import hashlib
 import io
 import json
 import logging
@@ -83,6 +84,7 @@ def _foreign(path: Path) -> None:
 
 
 def _half_written(path: Path) -> None:
+    _manifest(path).unlink()  # it comes last
     path.rename(path.with_name(f"{checkpoint.SAVING}200-{2**22 + 1}"))
 
 
@@ -97,6 +99,13 @@ def _changed_score(path: Path) -> None:
 
 def _other_version(path: Path) -> None:
     _manifest(path).write_text(json.dumps({"format": checkpoint.FORMAT, "version": 99}))
+
+
+def _forged(path: Path) -> None:
+    content = json.loads(_manifest(path).read_text())
+    del content["files"], content["checksum"]
+    checksum = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    _manifest(path).write_text(json.dumps({**content, "checksum": checksum}))
 
 
 _HARMS: tuple[tuple[str, Callable[[Path], Any], str | None], ...] = (
@@ -120,6 +129,7 @@ _HARMS: tuple[tuple[str, Callable[[Path], Any], str | None], ...] = (
     ("the manifest is no text", lambda p: _manifest(p).write_bytes(b"\xff\x00"), "bad-manifest"),
     ("the score in the manifest is changed", _changed_score, "bad-manifest"),
     ("the manifest is of a later version", _other_version, "unknown-format"),
+    ("the manifest has a right checksum, but no files", _forged, "bad-manifest"),
     ("its writer was killed before the end", _half_written, "unfinished"),
     ("its remover was killed before the end", _half_removed, None),
 )
@@ -160,6 +170,16 @@ class _Told(logging.Handler):
 
 for _name, _harm, _reason in _HARMS:
     case("checkpoint", _name, harm=_harm, reason=_reason)(_damaged_checkpoint)
+
+
+@case("checkpoint", "its writer was killed before it gave it its name")
+def _nameless(folder: Path) -> Outcome:
+    store = shutil.copytree(_saved(), folder / "checkpoints")
+    whole = snapshot(store)
+    (store / "200").rename(store / f"{checkpoint.SAVING}200-{2**22 + 1}")
+    assert checkpoint.latest_valid(store, fingerprints=["mine"]) == (200, store / "200")
+    assert snapshot(store) == whole
+    return Outcome("whole: it is given its name, and used")
 
 
 @case("checkpoint", "every one is damaged")

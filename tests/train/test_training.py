@@ -199,6 +199,19 @@ def test_checkpoints_of_other_data_are_set_aside(command: Command, tmp_path: Pat
     assert {path.name for path in aside.iterdir()} == {"4-foreign", "8-foreign", "12-foreign"}
 
 
+def test_a_network_of_another_version_is_told_and_not_a_traceback(
+    command: Command, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command.told = lambda line: os.kill(os.getpid(), signal.SIGTERM) if line == "9" else None
+    assert command() == 130
+    play.model.cache_clear()
+    command.patch.setattr(play, "small", lambda config: config)
+    assert command() == 2
+    play.model.cache_clear()
+    error = " ".join(capsys.readouterr().err.split())
+    assert "checkpoints/9: leaf " in error and "the checkpoint has" in error
+
+
 def sessions(folder: Path) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = json.loads((folder / "env.json").read_text())["sessions"]
     return found
