@@ -38,6 +38,7 @@ from palm_jax.train import (
     locks,
     methods,
     records,
+    shards,
     table_page,
     versions,
     workspace,
@@ -115,7 +116,8 @@ def cells(config: TableConfig) -> list[Cell]:
     next method's, palm and bc first.
 
     Raises:
-      ConfigError: an unknown preset, task or method, or a shard that is none.
+      ConfigError: an unknown preset, task or method.
+      ShardError: a shard that is none.
     """
     _check(config)
     order = [*_FIRST, *[name for name in config.methods if name not in _FIRST]]
@@ -126,7 +128,7 @@ def cells(config: TableConfig) -> list[Cell]:
         for seed in config.seeds
         for task in config.tasks
     ]
-    index, count = _shard(config.shard)
+    index, count = shards.parse(config.shard)
     return every[index - 1 :: count]
 
 
@@ -147,13 +149,6 @@ def _check(config: TableConfig) -> None:
         values = getattr(config, name)
         if not values or len(set(values)) < len(values):
             raise ConfigError(f"{name}: expected one or more, each once, got {values}")
-
-
-def _shard(text: str) -> tuple[int, int]:
-    index, _, count = text.partition("/")
-    if index.isdigit() and count.isdigit() and 1 <= int(index) <= int(count):
-        return int(index), int(count)
-    raise ConfigError(f"shard: expected i/n with i from 1 to n, got {text!r}")
 
 
 def cell_config(config: TableConfig, cell: Cell) -> Config:
@@ -260,7 +255,7 @@ def run(config: TableConfig, console: Console) -> Path:
     """Runs what is missing; returns the file.
 
     Raises:
-      ConfigError: see `cells`, `read` and `_merge`.
+      ConfigError, ShardError: see `cells`, `read` and `_merge`.
       KeyboardInterrupt: the running cell was stopped; it resumes from its last checkpoint.
     """
     asked, fresh = cells(config), header(config)
@@ -544,7 +539,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         with interrupts.raising():
             path = run(config, console)
-    except (ConfigError, records.RecordError, OSError) as error:
+    except (ConfigError, shards.ShardError, records.RecordError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

@@ -92,6 +92,11 @@ def test_shards_divide_the_cells() -> None:
     assert sum(map(len, parts)) == 12 and len(set().union(*parts)) == 12
 
 
+def test_a_shard_that_is_none_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(dataclasses.replace(SMALL, out=tmp_path, shard="3/2")) == 2
+    assert "shard: expected i/n with i from 1 to n, got '3/2'" in capsys.readouterr().err
+
+
 def test_a_cell_is_a_training_command(tmp_path: Path) -> None:
     config = dataclasses.replace(SMALL, out=tmp_path)
     cell = table.cell_config(config, table.Cell("lift_spam", "arro", 1))
@@ -303,7 +308,6 @@ def test_a_cell_whose_times_are_not_known_is_entered(
         ({"tasks": ("lid",)}, "unknown task 'lid'; known: lift_lid"),
         ({"methods": ("plam",)}, "unknown method 'plam'; known: palm"),
         ({"preset": "huge"}, "unknown preset 'huge'; known: quick"),
-        ({"shard": "3/2"}, "shard: expected i/n with i from 1 to n, got '3/2'"),
         ({"seeds": (1, 1)}, "seeds: expected one or more, each once"),
     ],
 )
