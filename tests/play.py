@@ -7,9 +7,13 @@ checkpoint gets other results. What is replaced is named in `scenery`; nothing e
 import dataclasses
 import functools
 import hashlib
+import itertools
 import json
+import os
+import subprocess
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -40,7 +44,8 @@ def words(out: Path, *more: object, **options: object) -> list[str]:
     data = out.with_name("demos.hdf5")
     if not data.exists():
         data.parent.mkdir(parents=True, exist_ok=True)
-        demonstrations(data)
+        half = data.with_suffix(f".{os.getpid()}")  # who calls may be killed
+        demonstrations(half).replace(data)
     found = ["--out", str(out), "--data", str(data), "--method", "palm", "--no-sweep"]
     for name, value in {**TINY, **options}.items():
         found += [f"--{name.replace('_', '-')}", str(value)]
@@ -49,9 +54,9 @@ def words(out: Path, *more: object, **options: object) -> list[str]:
     return [*found, *map(str, more)]
 
 
-def samples(config: Config, *_: object) -> learner.Batch:
-    """What the demonstrations look like: noise."""
-    rng, side = np.random.default_rng(0), config.image_size
+def samples(side: int) -> learner.Batch:
+    """What demonstrations look like: noise."""
+    rng = np.random.default_rng(0)
     return learner.Batch(
         {evaluate.VIEW: rng.integers(0, 256, (SAMPLES, side, side, 3), dtype=np.uint8)},
         rng.normal(size=(SAMPLES, PROPRIO)).astype(np.float32),
@@ -59,9 +64,9 @@ def samples(config: Config, *_: object) -> learner.Batch:
     )
 
 
-def backgrounds(config: Config) -> np.ndarray:
-    """Right in the first process alone: the others' do not count."""
-    rng, side = np.random.default_rng(1 + jax.process_index()), config.image_size
+def backgrounds(side: int) -> np.ndarray:
+    """Others in every process: those of the first count."""
+    rng = np.random.default_rng(1 + jax.process_index())
     return rng.integers(0, 256, (5, side, side, 3), dtype=np.uint8)
 
 
@@ -104,12 +109,20 @@ def _runners(*_: object, **__: object) -> Any:
     return SimpleNamespace(first=None, worlds={"panda": 1})
 
 
-def _keeping_the_last(folder: Path) -> Callable[..., learner.TrainState]:
-    """`learner.run`, whose result the first process leaves in FOLDER/final.npz."""
+def _training(folder: Path, fail_at: int) -> Callable[..., learner.TrainState]:
+    """`learner.run`, whose result the first process leaves in FOLDER/final.npz, and which fails
+    before an update."""
     train = learner.run
 
-    def kept(*arguments: Any, **options: Any) -> learner.TrainState:
-        state = train(*arguments, **options)
+    def kept(*arguments: Any, should_stop: Callable[[], bool], **options: Any) -> Any:
+        calls = itertools.count(1)
+
+        def look() -> bool:
+            if next(calls) == fail_at:
+                raise RuntimeError("broken on purpose")
+            return should_stop()
+
+        state = train(*arguments, should_stop=look, **options)
         if devices.is_first():
             leaves = jax.tree_util.tree_leaves_with_path(state)
             arrays = {jax.tree_util.keystr(name): np.asarray(leaf) for name, leaf in leaves}
@@ -120,7 +133,11 @@ def _keeping_the_last(folder: Path) -> Callable[..., learner.TrainState]:
 
 
 def scenery(
-    folder: Path, *, tell: Callable[[str], None] = lambda line: None, pause: float = 0.0
+    folder: Path,
+    *,
+    tell: Callable[[str], None] = lambda line: None,
+    pause: float = 0.0,
+    fail_at: int = 0,
 ) -> Iterator[tuple[Any, str, Any]]:
     """(object, attribute, value) of all that is to be replaced.
 
@@ -128,6 +145,7 @@ def scenery(
       folder: where the state at the end of a training is left.
       tell: called with the number of every step that was logged; all of them are.
       pause: seconds after that.
+      fail_at: the update, counted from where the training begins, before which it raises.
     """
 
     class Told(MetricsLog):
@@ -138,19 +156,51 @@ def scenery(
 
     yield Runners, "of", _runners
     yield workspace, "make_evaluator", _evaluator
-    yield run, "_samples", samples
+    yield run, "_samples", lambda config, *_: samples(config.image_size)
     yield run, "_film", lambda *_, **__: None
     yield report, "write_report", lambda *_, **__: None
-    yield training, "backgrounds", backgrounds
+    yield training, "backgrounds", lambda config: backgrounds(config.image_size)
     yield training, "LOG_EVERY", 1
     yield training, "MetricsLog", Told
-    yield learner, "run", _keeping_the_last(folder)
+    yield learner, "run", _training(folder, fail_at)
 
 
 def set_up(folder: Path, **options: Any) -> None:
     """Replaces it for the rest of a process; see `scenery`."""
     for place, name, value in scenery(folder, **options):
         setattr(place, name, value)
+
+
+def start(
+    folder: Path, *more: object, options: Mapping[str, Any] | None = None, **words_: object
+) -> subprocess.Popen[str]:
+    """The command in a process of its own (`train/training_process.py`).
+
+    Args:
+      folder: of the run.
+      more, words_: see `words`.
+      options: of the process.
+    """
+    root = Path(__file__).resolve().parents[1]
+    environment = {**os.environ, "PYTHONPATH": f"{root}{os.pathsep}{root / 'tests'}"}
+    # The processes run the same programs: the suite's cache compiles them once.
+    if cache := jax.config.jax_compilation_cache_dir:
+        environment["JAX_COMPILATION_CACHE_DIR"] = cache
+    script = root / "tests" / "train" / "training_process.py"
+    command = [str(script), str(folder), json.dumps(options or {}), *words(folder, *more, **words_)]
+    return subprocess.Popen(
+        [sys.executable, *command],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def finish(*processes: subprocess.Popen[str]) -> None:
+    """Waits for them; all must end well."""
+    outputs = [process.communicate(timeout=300)[0] for process in processes]
+    assert [process.returncode for process in processes] == [0] * len(processes), outputs
 
 
 def final(folder: Path) -> dict[str, np.ndarray]:

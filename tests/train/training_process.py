@@ -1,22 +1,24 @@
 """The training command without a simulator, in a process of its own, to be killed or joined:
 
-    python training_process.py FOLDER DEVICES PAUSE WORDS...
+    python training_process.py FOLDER OPTIONS WORDS...
 
-DEVICES are virtual ones of this process, which must choose them at the start; it sleeps for PAUSE
-seconds after every line of the log. WORDS are those of `python -m palm_jax.train`.
+OPTIONS are a JSON object: "devices" are virtual ones of this process, which must choose them at the
+start; the others are those of `play.scenery`. WORDS are those of `python -m palm_jax.train`.
 """
 
 import functools
+import json
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 
 HEARTBEAT = 10  # seconds without which a process of several counts as dead; JAX's own are 100
 
 
-def main(folder: Path, devices: int, pause: float, words: list[str]) -> int:
+def main(folder: Path, words: list[str], *, devices: int = 1, **options: Any) -> int:
     """The command's exit status."""
     jax.config.update("jax_num_cpu_devices", devices)
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
@@ -28,9 +30,9 @@ def main(folder: Path, devices: int, pause: float, words: list[str]) -> int:
 
     from palm_jax.train import __main__ as command
 
-    play.set_up(folder, pause=pause)
+    play.set_up(folder, **options)
     return command.main(words)
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]), sys.argv[4:]))
+    sys.exit(main(Path(sys.argv[1]), sys.argv[3:], **json.loads(sys.argv[2])))
