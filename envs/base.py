@@ -80,7 +80,7 @@ class State:
     reachable: jax.Array  # bool []: one of them was; otherwise the arm waits at its home pose
     step: jax.Array  # int32 [] control steps taken
     success: jax.Array  # bool []: solved at some step so far
-    nan: jax.Array  # bool []: physics diverged; the world stays at its last finite state
+    nan: jax.Array  # bool []: physics diverged unsolved; the world stays at its last finite state
 
 
 def _uniform(key: jax.Array, bounds: jax.Array) -> jax.Array:
@@ -433,10 +433,15 @@ class Env:
         return self._servo_targets(arm, opening)
 
     def judge(self, state: State, data: mjx.Data) -> State:
-        """The state after the physics of a step gave `data`: divergence, success, stage."""
+        """The state after the physics of a step gave `data`: divergence, success, stage.
+
+        A world that is solved has its outcome: how long it is stepped on after that depends on the
+        other worlds of its batch.
+        """
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
-        nan = state.nan | ~finite
-        data = jax.tree.map(lambda new, old: jnp.where(nan, old, new), data, state.data)
+        nan = state.nan | (~finite & ~state.success)
+        kept = nan | ~finite
+        data = jax.tree.map(lambda new, old: jnp.where(kept, old, new), data, state.data)
         after = dataclasses.replace(state, data=data)
         opening = self.opening(after)
         solved = self.task.success(self._ids, data, state.object_start, opening) & ~nan

@@ -31,7 +31,7 @@ class Episodes(NamedTuple):
     """Outcome of a batch of episodes; every field has the leading axis [N]."""
 
     success: jax.Array  # bool: solved at some step, and physics stayed finite until then
-    nan: jax.Array  # bool: physics diverged
+    nan: jax.Array  # bool: physics diverged before that
     seen: jax.Array  # bool: the global policy saw the target
     length: jax.Array  # int32: steps until success, or the horizon
     object_xy: jax.Array  # [N, 2] where the target started, metres
@@ -42,7 +42,7 @@ class Episodes(NamedTuple):
 
 def _outcome(state: State, length: jax.Array) -> Episodes:
     return Episodes(
-        success=state.success & ~state.nan,
+        success=state.success,
         nan=state.nan,
         seen=state.seen,
         length=length,

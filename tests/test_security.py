@@ -324,7 +324,7 @@ def hostile_run(folder: Path, **config: Any) -> None:
     lines = [json.dumps({"step": step, "loss": 1.0, HOSTILE: 2.0}) for step in range(3)]
     (folder / "metrics.jsonl").write_text("\n".join(lines) + "\n<script>\n")
     curve = records.StrengthSweep(HOSTILE, np.arange(2.0), np.ones((2, 3), bool), np.zeros((2, 3)))
-    records.save_strengths(folder / "strength-x.npz", curve)
+    records.save_sweep(folder / "strength-x.npz", curve)
 
 
 @pytest.mark.filterwarnings("ignore:Glyph")

@@ -20,6 +20,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         from palm_jax.train import config as configuration
         from palm_jax.train import console as terminal
         from palm_jax.train import devices, interrupts, recorded, run, training
+        from palm_jax.train.checkpoint import CheckpointError
         from palm_jax.train.data.errors import DataError
         from palm_jax.train.demos import DemoFileError
         from palm_jax.train.evaluate import out_of_memory
@@ -42,8 +43,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             else:
                 recorded.execute(config, console)
     except (
-        configuration.ConfigError, devices.DeviceError, DemoFileError, StartPoseError, RecordError,
-        Busy,
+        configuration.ConfigError, devices.DeviceError, CheckpointError, DemoFileError,
+        StartPoseError, RecordError, Busy,
     ) as error:  # fmt: skip
         print(f"error: {error}", file=sys.stderr)
         return devices.leave(2)

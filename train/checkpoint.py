@@ -20,15 +20,14 @@ that a checkpoint depends on no class of Flax or Optax; the target of `load` giv
 """
 
 import contextlib
+import errno
 import hashlib
-import importlib.metadata
 import json
 import logging
 import math
 import os
-import platform
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -38,6 +37,7 @@ import numpy as np
 import orbax.checkpoint as orbax
 from orbax.checkpoint import v1 as ocp
 
+from palm_jax.train import versions
 from palm_jax.train.metrics import fsync_folder, plain, write_atomic
 
 FORMAT = "palm_jax.checkpoint"
@@ -51,8 +51,13 @@ SCORE = "score"
 """The entry of a checkpoint's meta data by which `prune` and `best` choose; larger is better."""
 FINGERPRINT = "config"
 """The entry that says to which run's configuration a checkpoint belongs."""
+GONE = "gone"
+"""The reason of a checkpoint that was removed while it was read: nothing is damaged."""
 NEWEST = 2
 """How many of the newest `prune` spares: should the last be damaged, little is lost."""
+
+_OUR_OWN = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+"""Errors that are this process's or machine's, and say nothing of what was to be read."""
 
 _log = logging.getLogger(__name__)
 
@@ -154,15 +159,12 @@ def save(
             "step": int(step),
             "files": _hash_files(temporary),
             "leaves": {name: _describe(leaf) for name, leaf in named.items()},
-            "versions": _versions(),
+            "versions": versions.current(),
             "meta": plain(meta or {}),
         }
         _write_manifest(temporary, manifest)
         final = directory / str(step)
-        if final.exists():
-            _remove(final)
-        os.rename(temporary, final)
-        fsync_folder(directory)
+        _put_in_place(temporary, final)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
@@ -234,24 +236,33 @@ def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     write_atomic(folder / MANIFEST, (json.dumps(content, indent=1) + "\n").encode())
 
 
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for name in ("palm-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy"):
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:  # a checkout that was not installed
-            found[name] = "unknown"
-    return found
+def _put_in_place(new: Path, final: Path) -> None:
+    """Give a whole checkpoint its name. What had the name goes last: a crash on the way leaves one
+    of the two whole, under the name or under one that `_sweep_leftovers` knows."""
+    old = _hide(final) if final.exists() else None
+    try:
+        os.rename(new, final)
+    except BaseException:
+        if old is not None:
+            os.rename(old, final)
+        raise
+    fsync_folder(final.parent)
+    if old is not None:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _hide(path: Path) -> Path:
+    """Take the name from what is to be deleted; where it is then."""
+    hidden = path.with_name(f"{REMOVING}{path.name.lstrip('.')}-{os.getpid()}")
+    shutil.rmtree(hidden, ignore_errors=True)
+    os.rename(path, hidden)
+    return hidden
 
 
 def _remove(path: Path) -> None:
     """Delete a checkpoint such that a crash on the way never leaves a part under its name."""
-    if not path.exists():
-        return
-    hidden = path.with_name(f"{REMOVING}{path.name.lstrip('.')}-{os.getpid()}")
-    shutil.rmtree(hidden, ignore_errors=True)
-    os.rename(path, hidden)
-    shutil.rmtree(hidden, ignore_errors=True)
+    if path.exists():
+        shutil.rmtree(_hide(path), ignore_errors=True)
 
 
 # ---------------------------------------------------------------------------------------- verify
@@ -265,20 +276,38 @@ def verify(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     manifest = _read_manifest(path)
-    _refuse_ways_out(path, manifest["files"])
-    for name, expected in manifest["files"].items():
-        file = path / name
-        if not file.is_file():
-            raise DamagedCheckpoint(path, "missing-file", f"{name} is missing")
-        size = file.stat().st_size
-        if size != expected["size"]:
-            raise DamagedCheckpoint(
-                path, "wrong-size", f"{name} has {size} bytes, expected {expected['size']}"
-            )
-        with file.open("rb") as stream:
-            if hashlib.file_digest(stream, "sha256").hexdigest() != expected["sha256"]:
-                raise DamagedCheckpoint(path, "wrong-hash", f"{name} differs from what was written")
+    with _explained(path):
+        _refuse_ways_out(path, manifest["files"])
+        for name, expected in manifest["files"].items():
+            _verify_file(path, name, expected)
     return manifest
+
+
+def _verify_file(path: Path, name: str, expected: Mapping[str, Any]) -> None:
+    file = path / name
+    if not file.is_file():
+        raise DamagedCheckpoint(path, "missing-file", f"{name} is missing")
+    size = file.stat().st_size
+    if size != expected["size"]:
+        raise DamagedCheckpoint(
+            path, "wrong-size", f"{name} has {size} bytes, expected {expected['size']}"
+        )
+    with file.open("rb") as stream:
+        if hashlib.file_digest(stream, "sha256").hexdigest() != expected["sha256"]:
+            raise DamagedCheckpoint(path, "wrong-hash", f"{name} differs from what was written")
+
+
+@contextlib.contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """While files of a checkpoint are read: it may be removed meanwhile, and the disk may fail."""
+    try:
+        yield
+    except (DamagedCheckpoint, OSError) as error:
+        if not os.path.lexists(path):
+            raise DamagedCheckpoint(path, GONE, "there is none, or it has been removed") from error
+        if isinstance(error, DamagedCheckpoint) or error.errno in _OUR_OWN:
+            raise
+        raise DamagedCheckpoint(path, "unreadable", str(error)) from error
 
 
 def _refuse_ways_out(path: Path, names: Iterable[str]) -> None:
@@ -294,6 +323,11 @@ def _refuse_ways_out(path: Path, names: Iterable[str]) -> None:
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:
+    with _explained(path):
+        return _manifest_of(path)
+
+
+def _manifest_of(path: Path) -> dict[str, Any]:
     if path.is_symlink() or (path / MANIFEST).is_symlink():
         raise DamagedCheckpoint(path, "link", "expected a folder and files, not links")
     if not path.is_dir():
@@ -314,15 +348,36 @@ def _read_manifest(path: Path) -> dict[str, Any]:
             )
         content = {name: value for name, value in manifest.items() if name != "checksum"}
         intact = _digest(content) == manifest["checksum"]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         if isinstance(error, DamagedCheckpoint):
             raise
         raise DamagedCheckpoint(path, "bad-manifest", f"{MANIFEST} is unreadable") from error
     if not intact:
         raise DamagedCheckpoint(path, "bad-manifest", f"{MANIFEST} differs from its own checksum")
+    if wrong := _wrong_entry(manifest):
+        raise DamagedCheckpoint(
+            path, "bad-manifest", f"{MANIFEST}: {wrong} is not what it has to be, or is missing"
+        )
     if path.name.isdigit() and manifest["step"] != int(path.name):
         raise DamagedCheckpoint(path, "wrong-step", f"holds step {manifest['step']}")
     return manifest
+
+
+def _wrong_entry(manifest: Mapping[str, Any]) -> str | None:
+    """The first entry of a manifest that is of another kind than `save` writes: a checksum tells
+    damage, not who wrote it."""
+    kinds = {"step": int, "files": dict, "leaves": dict, "meta": dict}
+    for name, kind in kinds.items():
+        if type(manifest.get(name)) is not kind:
+            return name
+    for name, field, kind in (
+        ("files", "size", int), ("files", "sha256", str), ("leaves", "dtype", str),
+        ("leaves", "shape", list),
+    ):  # fmt: skip
+        for key, entry in manifest[name].items():
+            if not isinstance(entry, dict) or type(entry.get(field)) is not kind:
+                return f"{name}: {key}"
+    return None
 
 
 def steps(directory: str | Path) -> list[tuple[int, Path]]:
@@ -335,7 +390,7 @@ def steps(directory: str | Path) -> list[tuple[int, Path]]:
 
 
 def latest_valid(
-    directory: str | Path, *, repair: bool = True, fingerprint: str | None = None
+    directory: str | Path, *, repair: bool = True, fingerprints: Collection[str] = ()
 ) -> tuple[int, Path] | None:
     """The newest checkpoint that is whole, as (step, folder), or None if there is none.
 
@@ -344,40 +399,52 @@ def latest_valid(
       repair: move damaged checkpoints, and those that a killed process left half-written, to
         `directory/damaged/STEP-REASON`, and log a warning for each. False only looks: for readers
         of a folder into which another process may be writing.
-      fingerprint: a checkpoint whose meta data have another `FINGERPRINT` is another run's, and
-        treated like a damaged one.
+      fingerprints: if given, a checkpoint whose meta data have a `FINGERPRINT` that is none of them
+        is another run's, and treated like a damaged one.
     """
     directory = Path(directory)
     if repair and directory.is_dir():
         _sweep_leftovers(directory)
     for step, path in reversed(steps(directory)):
         try:
-            _refuse_foreign(path, verify(path), fingerprint)
+            _refuse_foreign(path, verify(path), fingerprints)
         except DamagedCheckpoint as damage:
-            if repair:
+            if repair and damage.reason != GONE:
                 _set_aside(path, f"{step}-{damage.reason}", str(damage))
             continue
         return step, path
     return None
 
 
-def _refuse_foreign(path: Path, manifest: Mapping[str, Any], fingerprint: str | None) -> None:
+def _refuse_foreign(path: Path, manifest: Mapping[str, Any], fingerprints: Collection[str]) -> None:
     found = manifest["meta"].get(FINGERPRINT)
-    if fingerprint is not None and found is not None and found != fingerprint:
+    if fingerprints and found is not None and found not in fingerprints:
         raise DamagedCheckpoint(path, "foreign", "belongs to a run with other options")
 
 
 def _sweep_leftovers(directory: Path) -> None:
     for path in sorted(directory.glob(f"{SAVING}*")):
         step, _, pid = path.name.removeprefix(SAVING).partition("-")
-        if not is_other_process(pid):
+        if _is_other_process(pid):
+            continue
+        final = directory / step
+        if not final.exists() and _is_whole(path, step):
+            _put_in_place(path, final)  # nothing but its name was missing
+        else:
             _set_aside(path, f"{step}-unfinished", f"{path}: never completed (unfinished)")
     for path in directory.glob(f"{REMOVING}*"):
-        if not is_other_process(path.name.rpartition("-")[2]):
+        if not _is_other_process(path.name.rpartition("-")[2]):
             shutil.rmtree(path, ignore_errors=True)
 
 
-def is_other_process(pid: str) -> bool:
+def _is_whole(path: Path, step: str) -> bool:
+    try:
+        return str(verify(path)["step"]) == step
+    except DamagedCheckpoint:
+        return False
+
+
+def _is_other_process(pid: str) -> bool:
     """Whether a process of this number, not ours, is alive: it may still be writing."""
     if not pid.isdecimal() or int(pid) == os.getpid():
         return False
@@ -489,6 +556,11 @@ def read_meta(path: str | Path) -> dict[str, Any]:
     return _read_manifest(Path(path))["meta"]
 
 
+def versions_of(path: str | Path) -> Any:
+    """What a checkpoint says of the versions that wrote it."""
+    return _read_manifest(Path(path)).get("versions")
+
+
 def content_hash(path: str | Path) -> str:
     """SHA-256 of what a checkpoint holds: equal for copies, whatever their meta data say."""
     manifest = _read_manifest(Path(path))
@@ -503,18 +575,18 @@ def update_meta(path: str | Path, **values: Any) -> None:
 
 
 def best(
-    directory: str | Path, *, count: int = 1, score: str = SCORE, fingerprint: str | None = None
+    directory: str | Path, *, count: int = 1, score: str = SCORE, fingerprints: Collection[str] = ()
 ) -> list[tuple[int, Path]]:
     """Up to `count` whole checkpoints by falling score, the newer first among equals.
 
-    Those without a finite score, and those of another `fingerprint`, are never among them.
+    Those without a finite score, and another run's (see `latest_valid`), are never among them.
     """
     ranked: list[tuple[int, Path]] = []
     for step, path in _ranked(Path(directory), score):
         if len(ranked) == count:
             break
         try:
-            _refuse_foreign(path, verify(path), fingerprint)
+            _refuse_foreign(path, verify(path), fingerprints)
         except DamagedCheckpoint as damage:
             _log.warning("checkpoint passed over: %s", damage)
         else:

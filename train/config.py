@@ -34,6 +34,7 @@ class Learning:
       out: the run folder; by default one in runs/ that is named after the main options.
       resume: go on with the run in `out`.
       take_over: also if a process on another machine has claimed `out`: only if it is gone.
+      other_versions: also where packages have other versions than when it was begun.
       data: demonstrations to use (made if the file does not exist); by default inside `out`. With
         --calibration: recordings of any robot, a robomimic file or a LeRobot folder.
       image_size: side of the policy's image in pixels, before the random crop.
@@ -63,6 +64,7 @@ class Learning:
     out: Path | None = None
     resume: bool = False
     take_over: bool = False
+    other_versions: bool = False
     data: Path | None = None
     image_size: int = 64
     random_crop: int = 58

@@ -13,7 +13,6 @@ Actions are what was commanded, so that jump is in none of them.
 import dataclasses
 import hashlib
 import json
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from palm_jax.align import AlignSpec, Camera
 from palm_jax.envs.base import PAPER_FRAME, Env, EnvParams, State
 from palm_jax.envs.expert import Demonstrator, Recording
 from palm_jax.envs.rollout import Runner, repeat_params, take_params
-from palm_jax.train import checkpoint
+from palm_jax.train.metrics import write_atomic
 
 FORMAT = "palm_jax-demos"
 VERSION = 2
@@ -57,6 +56,7 @@ class Demos:
     camera_to_world: np.ndarray  # [E, 4, 4]
     params: EnvParams  # leading axis [E]
     attempts: int  # episodes that the expert needed
+    digest: str  # SHA-256 of everything in the file
 
     @property
     def episodes(self) -> int:
@@ -76,7 +76,7 @@ def collect(
 
     Args:
       runner: compiled environment.
-      path: the file; written under another name and moved when whole.
+      path: the file; written at the end, whole or not at all.
       count: successful demonstrations to keep.
       seed: every scene and disturbance follows from it.
       noise: standard deviation of the disturbance, metres.
@@ -84,49 +84,40 @@ def collect(
 
     Raises:
       FileExistsError: `path` exists; nothing is ever overwritten.
+      OSError: it cannot be written, e.g. on a full disk.
       RuntimeError: the expert fails so often that `count` is out of reach.
     """
     if path.exists():
         raise FileExistsError(
             f"{path} exists and is not overwritten: move it, or choose another name"
         )
-    path.parent.mkdir(parents=True, exist_ok=True)
     demonstrator = Demonstrator(runner)
     params = repeat_params(runner.env.default_params(), runner.worlds)
     root = jax.random.fold_in(jax.random.key(seed), 0xDE305)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    for left in path.parent.glob(f".{path.name}.*.tmp"):
-        if not checkpoint.is_other_process(left.name.split(".")[-2]):
-            left.unlink()  # by a process that was killed
     kept = attempts = 0
-    try:
-        with h5py.File(partial, "w") as file:
-            data = file.create_group("data")
-            for batch in range(4 * (count // runner.worlds + 1)):
-                key, scenes = jax.random.split(jax.random.fold_in(root, batch))
-                keys = jax.random.split(scenes, runner.worlds)
-                recording = demonstrator(key, keys, params, noise=noise)
-                for world in np.flatnonzero(recording.success)[: count - kept]:
-                    attempts_now = attempts + int(world) + 1
-                    _write_demo(
-                        data, kept, runner.env, recording, int(world), params, (seed, batch)
-                    )
-                    kept += 1
-                attempts = attempts_now if kept == count else attempts + runner.worlds
-                if progress:
-                    progress(kept)
-                if kept == count:
-                    break
-            else:
-                raise RuntimeError(f"the expert solved only {kept} of {attempts} scenes")
-            _write_header(data, runner.env, seed=seed, noise=noise, attempts=attempts)
-            data.attrs[_DIGEST] = _digest(data)
-        with partial.open("rb") as written:
-            os.fsync(written.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-    return path
+    # In memory, a few dozen kB a demonstration: on a full disk HDF5 cannot even close a file.
+    with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
+        data = file.create_group("data")
+        for batch in range(4 * (count // runner.worlds + 1)):
+            key, scenes = jax.random.split(jax.random.fold_in(root, batch))
+            keys = jax.random.split(scenes, runner.worlds)
+            recording = demonstrator(key, keys, params, noise=noise)
+            for world in np.flatnonzero(recording.success)[: count - kept]:
+                attempts_now = attempts + int(world) + 1
+                _write_demo(data, kept, runner.env, recording, int(world), params, (seed, batch))
+                kept += 1
+            attempts = attempts_now if kept == count else attempts + runner.worlds
+            if progress:
+                progress(kept)
+            if kept == count:
+                break
+        else:
+            raise RuntimeError(f"the expert solved only {kept} of {attempts} scenes")
+        _write_header(data, runner.env, seed=seed, noise=noise, attempts=attempts)
+        data.attrs[_DIGEST] = _digest(data)
+        file.flush()
+        content = file.id.get_file_image()
+    return write_atomic(path, content)
 
 
 def _digest(data: h5py.Group) -> str:
@@ -265,7 +256,8 @@ def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None
         if found != value:
             advice = "; move it away and collect again" if name == "version" else ""
             raise DemoFileError(f"{path}: expected {name} {value!r}, found {found!r}{advice}")
-    if _DIGEST in data.attrs and data.attrs[_DIGEST] != _digest(data):
+    digest = _digest(data)
+    if data.attrs.get(_DIGEST, digest) != digest:
         raise DemoFileError(
             f"{path}: the content differs from what was written; move it away and collect again"
         )
@@ -297,6 +289,7 @@ def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None
         camera_to_world=np.stack([demo.attrs["camera_to_world"] for demo in demos]),
         params=EnvParams(**{name: jnp.asarray(value) for name, value in params.items()}),
         attempts=int(data.attrs["attempts"]),
+        digest=digest,
     )
 
 

@@ -822,6 +822,13 @@ def run(
     key, state, backgrounds = split.everywhere((keys.step, state, backgrounds))
     step = learner.step_over(split)
     done = saved = int(state.step)
+
+    def look(state: TrainState) -> None:
+        if on_failure and int(state.skipped) > config.max_skipped_steps:
+            alone, bank = split.on_one(state), split.on_one(backgrounds)
+            on_failure(_find_failure(learner, keys, alone, data, bank, log_every))
+        check_skipped(int(state.skipped), int(state.step), config)
+
     while done < last and not (should_stop and should_stop()):
         batch = split.rows(data, batch_indices(keys.order, done, count, config.batch_size))
         state, metrics = step(key, state, batch, backgrounds)
@@ -830,14 +837,11 @@ def run(
             numbers = {name: float(value) for name, value in metrics.items()}
             if on_log:
                 on_log(done, numbers)
-            if on_failure and int(numbers["skipped"]) > config.max_skipped_steps:
-                alone = split.on_one(state), split.on_one(backgrounds)
-                on_failure(_find_failure(learner, keys, alone[0], data, alone[1], log_every))
-            check_skipped(int(numbers["skipped"]), done, config)
+            look(state)
         if on_checkpoint and checkpoint_every and done % checkpoint_every == 0:
             on_checkpoint(done, split.on_one(state))
             saved = done
-    check_skipped(int(state.skipped), done, config)
+    look(state)  # a stop may have come between two lines of the log
     state = split.on_one(state)
     if on_checkpoint and checkpoint_every and saved != done:
         on_checkpoint(done, state)

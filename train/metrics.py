@@ -2,8 +2,9 @@
 
 `metrics.jsonl` has one JSON object a line, with the integer `step` first. Each line is flushed as
 it is written, so a killed run loses at most the line it was writing; that half line, and every
-line beyond the step from which the run goes on, are dropped when the log is opened again. The log
-of a run that was killed and resumed therefore has the same steps as that of one that was not.
+line beyond the step from which the run goes on, are dropped when the log is opened again, and what
+the kill left out is written then. The log of a run that was killed and resumed is therefore that of
+one that was not.
 
 JSON has no NaN and no infinity: such numbers are written as null.
 """
@@ -142,11 +143,11 @@ class MetricsLog:
     def __init__(self, path: str | Path, *, resume_step: int | None = None):
         self.path = Path(path)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        if self.path.exists():
-            self._rewind(resume_step)
+        self._kept = self._rewind(resume_step) if self.path.exists() else []
         self._file = self.path.open("a", encoding="utf-8")
 
-    def _rewind(self, resume_step: int | None) -> None:
+    def _rewind(self, resume_step: int | None) -> list[dict[str, Any]]:
+        """The records that stay."""
         content = self.path.read_bytes()
         records, damaged = _parse(content)
         if resume_step is None:
@@ -163,6 +164,13 @@ class MetricsLog:
         new = "".join(json.dumps(record, allow_nan=False) + "\n" for record in kept).encode()
         if new != content:
             write_atomic(self.path, new)
+        return kept
+
+    def write_once(self, step: int, values: Mapping[str, Any]) -> None:
+        """`write`, unless the log had such a record when it was opened."""
+        names = {"step", *values}
+        if not any(record["step"] == step and record.keys() == names for record in self._kept):
+            self.write(step, values)
 
     def write(self, step: int, values: Mapping[str, Any]) -> None:
         """Append one record: the step, then `values` as `plain` makes them."""
@@ -172,11 +180,15 @@ class MetricsLog:
         self._file.write(json.dumps(record, allow_nan=False) + "\n")
         self._file.flush()
 
+    def sync(self) -> None:
+        """Make everything written durable."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
     def close(self) -> None:
         """Make everything written durable, and close the file."""
         if not self._file.closed:
-            self._file.flush()
-            os.fsync(self._file.fileno())
+            self.sync()
             self._file.close()
 
     def __enter__(self) -> Self:

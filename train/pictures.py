@@ -1,5 +1,6 @@
 """Reading pictures: the one place where Pillow opens what somebody else has made."""
 
+import hashlib
 from pathlib import Path
 from typing import BinaryIO
 
@@ -36,19 +37,39 @@ def rgb(source: Path | BinaryIO, size: int | None = None) -> np.ndarray:
         raise ValueError(words) from error
 
 
-def read_folder(folder: Path, size: int, *, most: int = 512) -> np.ndarray:
+MOST = 512  # pictures of a folder
+
+
+def read_folder(folder: Path, size: int, *, most: int = MOST) -> np.ndarray:
     """Up to `most` pictures of a folder, by name, as uint8 [K, size, size, 3] (aspect ignored).
 
     Raises:
       ValueError: no picture in the folder, or one that cannot be read (it is named).
     """
-    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in _SUFFIXES)[:most]
-    if not files:
-        raise ValueError(f"{folder} holds no picture ({', '.join(sorted(_SUFFIXES))})")
     pictures = []
-    for file in files:
+    for file in _files(folder, most):
         try:
             pictures.append(rgb(file, size))
         except ValueError as error:
             raise ValueError(f"{file} cannot be read as a picture: {error}") from error
     return np.stack(pictures)
+
+
+def digest(folder: Path, *, most: int = MOST) -> str:
+    """SHA-256 of the pictures that `read_folder` reads, in their order.
+
+    Raises:
+      ValueError: no picture in the folder.
+    """
+    found = hashlib.sha256()
+    for file in _files(folder, most):
+        content = file.read_bytes()
+        found.update(f"{len(content)} ".encode() + content)
+    return found.hexdigest()
+
+
+def _files(folder: Path, most: int) -> list[Path]:
+    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in _SUFFIXES)[:most]
+    if not files:
+        raise ValueError(f"{folder} holds no picture ({', '.join(sorted(_SUFFIXES))})")
+    return files

@@ -152,12 +152,11 @@ def _execute(config: Recorded, recording: Recording, out: Path, console: Console
     facts = _facts(recording, split)
     for each in jobs:
         workspace.begin_run(each.stored(facts), each.folder, resume=config.resume)
+        workspace.bind_backgrounds(each.folder, config, each.method)
     terminal.header(console, "palm_jax", _header(config, recording, survey, split, out))
     found = {}
     for each in jobs:
-        began = time.monotonic()
-        found[each.method.name] = each.perform(facts, console)
-        _note_environment(config, each.folder, time.monotonic() - began)
+        found[each.method.name] = each.perform(console)
     _picture(jobs, out)
     report.write_report(out)
     terminal.held_out(console, {n: entry for n, entry in found.items() if "loss" in entry})
@@ -210,12 +209,6 @@ def _distances(recording: Recording, episode: str) -> np.ndarray:
     return np.linalg.norm(recording.trajectory(episode).tcp[:, :3, 3] - camera, axis=1)
 
 
-def _note_environment(config: Recorded, folder: Path, wall_s: float) -> None:
-    path = folder / "env.json"
-    earlier = training.noted(path).get("wall_s", 0.0)
-    write_json(path, workspace.environment(config, wall_s=earlier + wall_s))
-
-
 # ------------------------------------------------------------------------------------- one method
 
 
@@ -235,13 +228,11 @@ class _Job:
         config = dataclasses.replace(
             self.config, task=self.config.task or str(facts["recorded_task"])
         )
-        names = [f.name for f in dataclasses.fields(config) if f.name not in workspace.NOT_STORED]
-        fields = {name: getattr(config, name) for name in names}
         spec = dataclasses.asdict(self.spec)
         values: dict[str, Any] = plain(
             {
                 "kind": workspace.RECORDED,
-                **fields,
+                **workspace.options(config),
                 "method": self.method.name,
                 **facts,
                 "spec": spec,
@@ -249,7 +240,7 @@ class _Job:
         )
         return values
 
-    def perform(self, facts: Mapping[str, Any], console: Console) -> dict[str, Any]:
+    def perform(self, console: Console) -> dict[str, Any]:
         """Trains, and gives what `held_out.json` holds: how good the chosen checkpoint is on what
         was held out."""
         name = self.method.name
@@ -257,25 +248,28 @@ class _Job:
         if path.exists():
             console.print(f"{name}: trained already")
             return records.load_json(path)
-        model = learner.make_learner(
-            self.config.learner(self.method), self.spec.proprio_size, (VIEW,)
-        )
-        belongs = workspace.fingerprint_of(self.stored(facts))
-        with self._aligned("train", self.split.train, console) as data:
-            with self._aligned("check", self.split.held_out, console) as checked:
-                self._training(model, belongs, checked).train(data, console)
-                step, best = workspace.best_checkpoint(self.folder, belongs)
-                policy = model.policy_state(checkpoint.load(best, model.abstract_state()))
-                found = held_out.measure(model, policy, checked) if len(checked.proprio) else {}
-            self._note_views(data)
+        with workspace.session(self.config, self.folder):
+            step, found = self._train(console)
         # Written last: its presence says that the method is finished.
         values = {"step": step, "episodes": len(self.split.held_out), **found}
         write_json(path, values)
         return values
 
-    def _training(
-        self, model: learner.Learner, belongs: str, checked: learner.Batch
-    ) -> training.Training:
+    def _train(self, console: Console) -> tuple[int, dict[str, Any]]:
+        """The step of the checkpoint that was chosen, and how good it is."""
+        model = learner.make_learner(
+            self.config.learner(self.method), self.spec.proprio_size, (VIEW,)
+        )
+        with self._aligned("train", self.split.train, console) as data:
+            with self._aligned("check", self.split.held_out, console) as checked:
+                self._training(model, checked).train(data, console)
+                step, best = workspace.best_checkpoint(self.folder)
+                policy = model.policy_state(checkpoint.load(best, model.abstract_state()))
+                found = held_out.measure(model, policy, checked) if len(checked.proprio) else {}
+            self._note_views(data)
+        return step, found
+
+    def _training(self, model: learner.Learner, checked: learner.Batch) -> training.Training:
         def score(step: int, state: learner.TrainState) -> training.Score:
             if not len(checked.proprio):
                 return training.Score(float(step), {})
@@ -286,7 +280,7 @@ class _Job:
             )
 
         return training.Training(
-            self.config, self.method.name, model, self.folder, belongs, score, self.method.augment
+            self.config, self.method.name, model, self.folder, score, self.method.augment
         )
 
     @contextmanager

@@ -6,13 +6,15 @@ A run folder holds::
 
 `eval.json` is `{domain: {"successes": int, "episodes": int, "nan": int}}`; `eval.npz` holds the
 same episodes one by one as arrays named `domain/field`, the fields of `DomainRecord`; `sweep.npz`
-holds the arrays of `Sweep`, `strength-SHIFT.npz` those of `StrengthSweep`; a sweep with another
-robot than the trained one has `-ROBOT` at the end of its name. Readers raise `RecordError`, which
+holds the arrays of `Sweep`, `strength-SHIFT.npz` those of `StrengthSweep`, with a header that says
+of which policy they are; a sweep with another robot than the trained one has `-ROBOT` at the end of
+its name. Readers raise `RecordError`, which
 names the file and the problem.
 """
 
 import io
 import json
+import math
 import re
 import struct
 import warnings
@@ -24,7 +26,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from palm_jax.train.metrics import read_metrics, write_atomic
+from palm_jax.train.metrics import plain, read_metrics, write_atomic
+
+HEADER = "header"
+"""Name of the array with the conditions of a sweep, as JSON."""
 
 HELD_OUT = "held_out.json"
 """Of a run on recordings: figures on the episodes that were held out (`train.held_out`)."""
@@ -192,9 +197,30 @@ def save_eval(path: Path, records: Mapping[str, Mapping[str, ArrayLike] | Domain
     return save_arrays(path, arrays)
 
 
-def save_sweep(path: Path, sweep: Sweep) -> Path:
-    """Write sweep.npz, whole or not at all."""
-    return save_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
+def save_sweep(
+    path: Path, sweep: Sweep | StrengthSweep, header: Mapping[str, Any] | None = None
+) -> Path:
+    """Write a sweep of either kind, whole or not at all.
+
+    Args:
+      header: of which policy and under which conditions, as JSON can hold it.
+    """
+    arrays = {field.name: getattr(sweep, field.name) for field in fields(sweep)}
+    return save_arrays(path, arrays if header is None else with_header(arrays, header))
+
+
+def with_header(arrays: Mapping[str, ArrayLike], header: Mapping[str, Any]) -> dict[str, ArrayLike]:
+    """Arrays for an .npz file, with a header as one of them."""
+    return {**arrays, HEADER: np.asarray(json.dumps(plain(header), sort_keys=True))}
+
+
+def header_of(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """The header among arrays; empty if there is none."""
+    try:
+        header = json.loads(str(arrays[HEADER]))
+    except (KeyError, ValueError):
+        return {}
+    return header if isinstance(header, dict) else {}
 
 
 def sweep_path(folder: Path, robot: str = "", *, shift: str = "") -> Path:
@@ -220,14 +246,10 @@ def swept_robot(path: Path) -> str:
     return "-".join(words[2 if words[0] == "strength" else 1 :])
 
 
-def save_strengths(path: Path, sweep: StrengthSweep) -> Path:
-    """Write a `StrengthSweep`, whole or not at all."""
-    return save_arrays(path, {field.name: getattr(sweep, field.name) for field in fields(sweep)})
-
-
 def load_strengths(path: Path) -> StrengthSweep:
     """Read a `StrengthSweep`."""
     arrays = load_arrays(path)
+    arrays.pop(HEADER, None)
     _refuse_unknown(path, arrays, [field.name for field in fields(StrengthSweep)])
     missing = {field.name for field in fields(StrengthSweep)} - {"worlds", *arrays}
     if missing:
@@ -303,6 +325,7 @@ def load_eval(path: Path) -> dict[str, DomainRecord]:
 def load_sweep(path: Path) -> Sweep:
     """Read sweep.npz."""
     arrays = load_arrays(path)
+    arrays.pop(HEADER, None)
     _refuse_unknown(path, arrays, [field.name for field in fields(Sweep)])
     missing = {"angles", "xs", "ys", "success"} - set(arrays)
     if missing:
@@ -336,6 +359,34 @@ def load_json(path: Path) -> dict[str, Any]:
     return content
 
 
+def load_sessions(path: Path) -> list[dict[str, Any]]:
+    """Read env.json: an entry for every time that a run was worked on, the first one first. Files
+    of before there were several hold the last one alone."""
+    content = load_json(path)
+    sessions = content.get("sessions", [content])
+    if not isinstance(sessions, list) or not all(isinstance(entry, dict) for entry in sessions):
+        raise RecordError(
+            f"{path}: sessions: expected a list of JSON objects, got {sessions!r:.80}"
+        )
+    return sessions
+
+
+def load_notes(path: Path) -> dict[str, Any]:
+    """A JSON object on which no result rests: empty if it is absent or damaged."""
+    try:
+        return load_json(path)
+    except RecordError:
+        return {}
+
+
+def seconds(notes: Mapping[str, Any], name: str) -> float | None:
+    """A time that was noted; None if it was not, or is none."""
+    value = notes.get(name)
+    if isinstance(value, (int, float)) and 0 <= value < math.inf:
+        return float(value)
+    return None
+
+
 def load_counts(path: Path) -> dict[str, dict[str, int]]:
     """Read eval.json and check that every domain holds sane counts."""
     result = {}
@@ -361,12 +412,19 @@ def check_counts(path: Path, episodes: Mapping[str, DomainRecord]) -> None:
     Raises:
       RecordError: they differ; the domain is named.
     """
-    stored, counted = load_counts(path), counts(episodes)
+    compare_counts(path, load_counts(path), episodes)
+
+
+def compare_counts(
+    where: object, stored: Mapping[str, Mapping[str, int]], episodes: Mapping[str, DomainRecord]
+) -> None:
+    """`check_counts` of counts that were read; `where` names them."""
+    counted = counts(episodes)
     for domain in {**stored, **counted}:
         if stored.get(domain) != counted.get(domain):
             raise RecordError(
-                f"{path}: {domain}: {stored.get(domain)}, but the episodes in the .npz file beside "
-                f"it count {counted.get(domain)}"
+                f"{where}: {domain}: {stored.get(domain)}, but the episodes in the .npz file "
+                f"beside it count {counted.get(domain)}"
             )
 
 

@@ -192,12 +192,13 @@ def facts(runs: Sequence[Run]) -> dict[str, str]:
     def first(*names: str) -> str:
         found = []
         for run in runs:
-            values = [lookup(run.env, name) for name in names]
-            values += [lookup(run.config, name) for name in names]
-            found.append(next((value for value in values if value is not None), None))
+            for session in run.sessions or [{}]:
+                values = [lookup(session, name) for name in names]
+                values += [lookup(run.config, name) for name in names]
+                found.append(next((value for value in values if value is not None), None))
         return _unique(found)
 
-    walls = [_seconds(run.env) for run in runs]
+    walls = [_seconds(session) for run in runs for session in run.sessions]
     known = [wall for wall in walls if wall is not None]
     wall = duration(sum(known)) + (" in all" if len(known) > 1 else "") if known else ""
     entries = {
@@ -236,21 +237,24 @@ def commands(runs: Sequence[Run]) -> list[str]:
     """The commands that made the runs: as recorded, else put together from config.json."""
     lines = []
     for run in runs:
-        recorded = lookup(run.env, "command") or lookup(run.env, "argv")
-        if isinstance(recorded, list):
-            line = shlex.join(map(str, recorded))
-        elif isinstance(recorded, str):
-            line = recorded
-        else:
-            words = ["python", "-m", "palm_jax.train"]
-            for name in ("task", "method", "preset", "seed"):
-                value = run.config.get(name)
-                if value is not None:
-                    words += [f"--{name}", str(value)]
-            line = shlex.join(words)
-        if line not in lines:
-            lines.append(line)
-    return lines
+        found = [_command(session) for session in run.sessions]
+        lines += [line for line in found if line] or [_command_of(run.config)]
+    return list(dict.fromkeys(lines))
+
+
+def _command(session: Mapping[str, Any]) -> str:
+    recorded = lookup(session, "command") or lookup(session, "argv")
+    if isinstance(recorded, list):
+        return shlex.join(map(str, recorded))
+    return recorded if isinstance(recorded, str) else ""
+
+
+def _command_of(config: Mapping[str, Any]) -> str:
+    words = ["python", "-m", "palm_jax.train"]
+    for name in ("task", "method", "preset", "seed"):
+        if (value := config.get(name)) is not None:
+            words += [f"--{name}", str(value)]
+    return shlex.join(words)
 
 
 def variant_notes(runs: Iterable[Run]) -> list[str]:
@@ -591,9 +595,9 @@ def _page(
 
 
 def _raw(run: Run) -> str:
-    if not run.config and not run.env:
+    if not run.config and not run.sessions:
         return ""
-    content = json.dumps({"config": run.config, "env": run.env}, indent=2, sort_keys=True)
+    content = json.dumps({"config": run.config, "env": run.sessions}, indent=2, sort_keys=True)
     return (
         f"<details><summary>configuration and environment of {esc(run.path.name)}</summary>"
         f"<pre>{esc(content)}</pre></details>"

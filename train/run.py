@@ -32,7 +32,7 @@ from palm_jax.train import (
     videos,
     workspace,
 )
-from palm_jax.train.config import Config, default_out
+from palm_jax.train.config import Config, ConfigError, default_out
 from palm_jax.train.evaluate import (
     VIEW,
     Evaluator,
@@ -59,7 +59,7 @@ def execute(config: Config, console: Console) -> Path:
     Of several processes the first does all of it, and the others take part in the training alone.
 
     Raises:
-      ConfigError: the folder holds another run.
+      ConfigError: the folder holds another run, or one on other data.
       DeviceError: the devices do not divide the batch.
       DemoFileError: the demonstrations cannot be used.
       StartPoseError: a domain asks for start poses that an arm cannot take.
@@ -106,13 +106,17 @@ def _execute(config: Config, out: Path, console: Console) -> Path:
         name: workspace.make_evaluator(config, methods.find(name), runners) for name in folders
     }
     data = _demonstrations(config, runners.first, console)
-    devices.wait()  # the others read what is written now
     for name, folder in folders.items():
-        began = time.monotonic()
+        workspace.bind_data(
+            folder, workspace.DEMONSTRATIONS, data.digest, _demonstration_file(config)
+        )
+        workspace.bind_backgrounds(folder, config, methods.find(name))
+    devices.wait()  # the others read what is written now
+    _agree_on_data(config, data)
+    for name, folder in folders.items():
         _one_method(config, evaluators[name], data, folder, console)
-        _note_environment(config, folder, time.monotonic() - began, runners.worlds)
     if config.sweep:
-        _sweeps(evaluators, folders, console)
+        _sweeps(evaluators, folders, console, other_versions=config.other_versions)
     _gallery(folders, out, console)
     report.write_report(out)
     counts = {name: records.load_counts(folder / "eval.json") for name, folder in folders.items()}
@@ -135,6 +139,7 @@ def _take_part(config: Config) -> None:
     data = demos.load(
         _demonstration_file(config), task=config.task, robot=config.robot, count=config.demos
     )
+    _agree_on_data(config, data)
     for name in config.method:
         if devices.from_first(False):
             continue
@@ -163,6 +168,16 @@ def _share_training(config: Config, evaluator: Evaluator, data: learner.Batch) -
         raise training.Interrupted
 
 
+def _agree_on_data(config: Config, data: demos.Demos) -> None:
+    """Raises ConfigError in a process whose demonstrations are not those of the first."""
+    ours = np.frombuffer(bytes.fromhex(data.digest), np.uint8)
+    if not np.array_equal(devices.from_first(ours), ours):
+        raise ConfigError(
+            f"{_demonstration_file(config)}: other demonstrations than those of the first process: "
+            "--data must be the same file everywhere"
+        )
+
+
 def _robots(config: Config) -> str:
     if not any(map(shifts.other_robot, config.domains)):
         return config.robot
@@ -173,15 +188,6 @@ def _worlds(config: Config) -> int:
     """Worlds in a batch: a domain's scenes at once, within what a CPU takes."""
     limit = physics.MAX_CPU_WORLDS
     return config.scenes if config.scenes <= limit else limit // 2
-
-
-def _note_environment(
-    config: Config, folder: Path, wall_s: float, worlds: Mapping[str, int]
-) -> None:
-    path = folder / "env.json"
-    earlier = training.noted(path).get("wall_s", 0.0)
-    found = workspace.environment(config, wall_s=earlier + wall_s)
-    write_json(path, {**found, "worlds": dict(worlds)})
 
 
 def _demonstration_file(config: Config) -> Path:
@@ -246,9 +252,11 @@ def _one_method(
     if devices.from_first(_finished(folder, console)):
         console.print(f"{method.name}: trained and evaluated already")
         return
-    _training(config, evaluator, folder).train(_samples(config, evaluator, data), console)
-    with training.timed(folder, "evaluation_s"):
-        _evaluate(config, evaluator, folder, console)
+    with workspace.session(config, folder) as notes:
+        _training(config, evaluator, folder).train(_samples(config, evaluator, data), console)
+        with training.timed(folder, "evaluation_s"):
+            _evaluate(config, evaluator, folder, console)
+        notes["worlds"] = dict(evaluator.runners.worlds)
 
 
 def _samples(config: Config, evaluator: Evaluator, data: demos.Demos) -> learner.Batch:
@@ -310,13 +318,11 @@ def _training(config: Config, evaluator: Evaluator, folder: Path) -> training.Tr
         return training.Score(success, {"in_domain_success": success})
 
     name = evaluator.method.name
-    belongs = workspace.fingerprint(config, name)
-    return training.Training(config, name, model, folder, belongs, score, evaluator.method.augment)
+    return training.Training(config, name, model, folder, score, evaluator.method.augment)
 
 
 def _evaluate(config: Config, evaluator: Evaluator, folder: Path, console: Console) -> None:
-    belongs = workspace.fingerprint(config, evaluator.method.name)
-    policy = workspace.best_policy(folder, evaluator.learner, belongs)
+    policy = workspace.best_policy(folder, evaluator.learner)
     traces: dict[tuple[str, str], films.Trace] = {}
 
     def watch(variant: str, domain: str) -> films.Trace:
@@ -404,13 +410,19 @@ def _film_domain(
             videos.write_video(folder / "videos" / name, frames)
 
 
-def _sweeps(evaluators: dict[str, Evaluator], folders: dict[str, Path], console: Console) -> None:
+def _sweeps(
+    evaluators: dict[str, Evaluator],
+    folders: dict[str, Path],
+    console: Console,
+    *,
+    other_versions: bool,
+) -> None:
     """A coarse sweep of every policy; `python -m palm_jax sweep RUN` makes finer ones."""
     options = sweep.SweepConfig(run=Path(), camera="-30:30:3")
     job = sweep.job(options)
     for name, folder in folders.items():
-        path = records.sweep_path(folder)
-        if path.exists():
+        path, header = records.sweep_path(folder), sweep.header_of(options, folder)
+        if path.exists() and sweep.is_of(path, header):
             continue
         evaluator = evaluators[name]
         with terminal.ProgressBar(console, job.episodes, f"sweep {name}", unit="episode") as bar:
@@ -418,9 +430,11 @@ def _sweeps(evaluators: dict[str, Evaluator], folders: dict[str, Path], console:
                 path,
                 evaluator,
                 workspace.best_policy(folder, evaluator.learner),
+                header=header,
                 seed=options.seed,
-                aligned=workspace.quoted_variant(folder) == "aligned",
+                aligned=header["aligned"],
                 progress=bar.advance,
+                other_versions=other_versions,
             )
 
 

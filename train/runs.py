@@ -20,7 +20,7 @@ class Run:
 
     path: Path
     config: dict[str, Any] = field(default_factory=dict)
-    env: dict[str, Any] = field(default_factory=dict)
+    sessions: list[dict[str, Any]] = field(default_factory=list)  # where, when and with what
     counts: Counts = field(default_factory=dict)
     episodes: dict[str, records.DomainRecord] = field(default_factory=dict)
     sweeps: dict[str, records.Sweep] = field(default_factory=dict)  # by robot, "" the trained one
@@ -76,7 +76,7 @@ def load_run(path: Path) -> Run:
             return default
 
     run.config = read("config.json", records.load_json, {})
-    run.env = read("env.json", records.load_json, {})
+    run.sessions = read("env.json", records.load_sessions, [])
     run.counts = read("eval.json", records.load_counts, {})
     run.episodes = read("eval.npz", records.load_eval, {})
     for file in sorted(path.glob("sweep*.npz")):

@@ -6,7 +6,6 @@ of the whole sweep, of which its own part counts, and a header with the conditio
 the shards of one command, after a look at their headers, into the file of the undivided sweep.
 """
 
-import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palm_jax.train import records
-from palm_jax.train.metrics import plain
 
 FOLDER = "shards"
-HEADER = "header"
 
 
 class ShardError(ValueError):
@@ -43,18 +40,6 @@ def path_of(whole: Path, index: int, count: int) -> Path:
     return whole.parent / FOLDER / f"{whole.stem}-{index}-of-{count}.npz"
 
 
-def save(path: Path, arrays: Mapping[str, Any], header: Mapping[str, Any]) -> Path:
-    """Writes a shard, whole or not at all.
-
-    Args:
-      arrays: those of the sweep's record.
-      header: the conditions, as JSON can hold them.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(plain(header), sort_keys=True)
-    return records.save_arrays(path, {**arrays, HEADER: np.asarray(text)})
-
-
 def load(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """A shard's arrays, and its header.
 
@@ -63,12 +48,9 @@ def load(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
       ShardError: it has no header.
     """
     arrays = records.load_arrays(path)
-    try:
-        header = json.loads(str(arrays.pop(HEADER)))
-    except (KeyError, ValueError, RecursionError) as error:
-        raise ShardError(f"{path}: not a shard of a sweep (no readable header)") from error
-    if not isinstance(header, dict):
-        raise ShardError(f"{path}: not a shard of a sweep (its header is no object)")
+    header = records.header_of(arrays)
+    if not header:
+        raise ShardError(f"{path}: not a shard of a sweep (no readable header)")
     return arrays, header
 
 

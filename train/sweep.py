@@ -11,7 +11,7 @@ cell.
 import dataclasses
 import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,9 +33,11 @@ from palm_jax.train import (
     report,
     runs,
     shards,
+    versions,
     workspace,
 )
 from palm_jax.train import console as terminal
+from palm_jax.train.config import ConfigError
 from palm_jax.train.evaluate import Evaluator, Runners
 from palm_jax.train.learner import PolicyState
 
@@ -56,6 +58,7 @@ class SweepConfig:
       seed: of the scenes.
       batch: worlds simulated at once (at most 128 on a CPU).
       redo: sweep again where a sweep is there already.
+      other_versions: go on with an unfinished sweep although packages have other versions now.
       shard: "i/n", the i-th of n machines (from 1): it runs its part of the grid's batches, or of
         the strengths, into RUN/shards.
       merge: join the shards of this very command into one sweep; nothing is run.
@@ -72,6 +75,7 @@ class SweepConfig:
     seed: int = 2000
     batch: int = 64
     redo: bool = False
+    other_versions: bool = False
     shard: str = ""
     merge: bool = False
     take_over: bool = False
@@ -153,6 +157,7 @@ def sweep(
     only: range | None = None,
     progress: Callable[[int], None] | None = None,
     partial_file: Path | None = None,
+    other_versions: bool = False,
 ) -> records.Sweep:
     """Runs every cell of the grid.
 
@@ -166,6 +171,10 @@ def sweep(
       only: rows of the episodes (`Job.part`) to run, all by default; the others stay failures.
       progress: told how many episodes were finished.
       partial_file: where finished episodes are kept meanwhile; those that are there are taken over.
+      other_versions: also if they were found under other versions.
+
+    Raises:
+      ConfigError: they were, and that is not allowed.
     """
     params = evaluator.runner.env.default_params()
     if aligned:
@@ -173,7 +182,7 @@ def sweep(
     cells = cell_params(params, angles, xs, ys, episodes)
     shape = (len(angles), len(xs), len(ys), episodes)
     question = _digest("grid", angles, xs, ys, episodes, seed, aligned, policy)
-    found = _Found(partial_file, question, int(np.prod(shape)), progress, only)
+    found = _Found(partial_file, question, int(np.prod(shape)), progress, only, other_versions)
     scenes = jax.random.fold_in(jax.random.key(seed), 0)
     for rows, part in evaluator.batches(policy, scenes, cells, found.end, first=found.done):
         found.add(rows, part)
@@ -194,6 +203,7 @@ def sweep_strength(
     only: range | None = None,
     progress: Callable[[int], None] | None = None,
     partial_file: Path | None = None,
+    other_versions: bool = False,
 ) -> records.StrengthSweep:
     """Runs the same scenes at every strength of a shift.
 
@@ -207,14 +217,14 @@ def sweep_strength(
       aligned: whether the hand's initial yaw turns with the camera.
       only: rows of the episodes (`Job.part`) to run, all by default; the others stay failures.
       progress: told how many episodes were finished.
-      partial_file: as for `sweep`.
+      partial_file, other_versions: as for `sweep`.
     """
     params = evaluator.runner.env.default_params()
     if aligned:
         params = shifts.aligned_hand(params)
     shape = (len(strengths), episodes)
     question = _digest(shift, strengths, episodes, seed, aligned, policy)
-    found = _Found(partial_file, question, int(np.prod(shape)), progress, only)
+    found = _Found(partial_file, question, int(np.prod(shape)), progress, only, other_versions)
     scenes = jax.random.key(seed)
     for row, strength in enumerate(strengths):
         begin = row * episodes
@@ -252,6 +262,7 @@ class _Found:
         total: int,
         progress: Callable[[int], None] | None,
         only: range | None = None,
+        other_versions: bool = False,
     ) -> None:
         """What the file holds of the same `question` is taken over; `progress` is told of it.
 
@@ -262,12 +273,14 @@ class _Found:
             self.done, self.end = only.start, only.stop
         self.success, self.nan = np.zeros((2, total), bool)
         self._path, self._question, self._progress = path, question, progress
+        self._header = {"versions": versions.current()}
         if path is not None and path.exists():
-            self._take_over(path)
+            self._take_over(path, other_versions)
 
-    def _take_over(self, path: Path) -> None:
+    def _take_over(self, path: Path, other_versions: bool) -> None:
         try:
             kept = records.load_arrays(path)
+            noted = records.header_of(kept).get("versions")
             if str(kept["question"]) != self._question:
                 return
             success, nan = kept["success"].astype(bool), kept["nan"].astype(bool)
@@ -277,6 +290,7 @@ class _Found:
             return
         if not self.done <= len(success) <= self.end:
             return
+        workspace.check_versions(path, noted, allowed=other_versions, instead="delete the file")
         self._tell(len(success) - self.done)
         self.done = len(success)
         self.success[: self.done], self.nan[: self.done] = success, nan
@@ -291,7 +305,7 @@ class _Found:
                 "success": self.success[: self.done],
                 "nan": self.nan[: self.done],
             }
-            records.save_arrays(self._path, arrays)
+            records.save_arrays(self._path, records.with_header(arrays, self._header))
         self._tell(len(rows))
 
     def _tell(self, count: int) -> None:
@@ -305,7 +319,6 @@ class Job(NamedTuple):
     worlds: int  # in a batch
     episodes: int  # in all
     run: Callable[..., Any]  # `sweep` or `sweep_strength`, their grids bound
-    save: Callable[[Path, Any], Path]
     record: type[Any]  # what is saved
     grid: dict[str, Any]  # fields of the record that the command says
     shape: tuple[int, ...]  # of the outcomes
@@ -323,18 +336,18 @@ class Job(NamedTuple):
         evaluator: Evaluator,
         policy: PolicyState,
         *,
-        save: Callable[[Path, Any], Path] | None = None,
+        header: Mapping[str, Any],
         **options: Any,
     ) -> Any:
         """Runs it into a file, by way of a partial one beside that.
 
         Args:
-          save: writes the file, if not as usual.
+          header: of the file, see `header_of`.
           options: see `sweep`.
         """
         kept = path.with_name(f".{path.name}.partial")
         found = self.run(evaluator, policy, partial_file=kept, **options)
-        (save or self.save)(path, found)
+        records.save_sweep(path, found, header)
         kept.unlink(missing_ok=True)
         return found
 
@@ -359,8 +372,7 @@ def job(config: SweepConfig) -> Job:
         shape: tuple[int, ...] = (len(strengths), count)
         line = {"shift": config.shift, "strengths": strengths}
         return Job(
-            worlds, int(np.prod(shape)), run, records.save_strengths, records.StrengthSweep, line,
-            shape, count,
+            worlds, int(np.prod(shape)), run, records.StrengthSweep, line, shape, count,
         )  # fmt: skip
     angles, (xs, ys) = angles_of(config.camera), cells_of(config.workspace)
     count = config.episodes or 1
@@ -368,8 +380,7 @@ def job(config: SweepConfig) -> Job:
     shape = (len(angles), len(xs), len(ys), count)
     axes = {"angles": angles, "xs": xs, "ys": ys}
     return Job(
-        config.batch, int(np.prod(shape)), grid, records.save_sweep, records.Sweep, axes, shape,
-        config.batch,
+        config.batch, int(np.prod(shape)), grid, records.Sweep, axes, shape, config.batch,
     )  # fmt: skip
 
 
@@ -402,6 +413,8 @@ def _run(config: SweepConfig, console: Console) -> list[Path]:
     folders = runs.find_runs(config.run) if config.run.is_dir() else []
     if not folders:
         raise FileNotFoundError(f"{config.run}: no run folder here")
+    for folder in folders:
+        _check_finished(folder)
     runners: dict[tuple[str, str], Runners] = {}
     left: list[Path] = []
     for folder in folders:
@@ -410,14 +423,14 @@ def _run(config: SweepConfig, console: Console) -> list[Path]:
         path = records.sweep_path(
             folder, "" if robot == stored.robot else robot, shift=config.shift
         )
+        header = header_of(config, folder)
         if config.merge:
-            asked.save(path, _merged(config, asked, folder, path))
+            arrays = shards.merge(path, asked.shape, asked.part, asked.grid, header)
+            records.save_sweep(path, asked.record(**asked.grid, **arrays), header)
             console.print(f"Joined: {path}", markup=False)
             continue
         into = shards.path_of(path, *shard) if config.shard else path
-        if into.exists() and not config.redo:
-            if config.shard:
-                shards.check(into, shards.load(into)[1], _header(config, folder))
+        if _is_there(into, header, config):
             console.print(f"{folder}: swept already (--redo to sweep again)", markup=False)
             continue
         world = stored.task, robot
@@ -432,11 +445,46 @@ def _run(config: SweepConfig, console: Console) -> list[Path]:
         try:
             name = f".{into.stem}.claim"
             with locks.claim(folder, name=name, take_over=config.take_over):
-                _sweep_one(folder, into, asked, config, runners[world], console)
+                # Another process may have made it since.
+                if not _is_there(into, header, config):
+                    _sweep_one(folder, into, asked, config, header, runners[world], console)
         except locks.Busy as error:
             console.print(f"{into} is left to another process: {error}", markup=False)
             left.append(into)
     return left
+
+
+def _check_finished(folder: Path) -> None:
+    """Raises ConfigError for a run whose policy may yet be another one."""
+    if not (folder / "eval.json").exists():
+        raise ConfigError(
+            f"{folder}: expected a finished run, but it has no eval.json: finish its training "
+            "first (--resume)"
+        )
+
+
+def _is_there(path: Path, header: Mapping[str, Any], config: SweepConfig) -> bool:
+    """Whether nothing is left to do for a sweep, or a shard of one.
+
+    Raises:
+      ShardError: a shard of other conditions is there.
+    """
+    if config.redo or not path.exists():
+        return False
+    if config.shard:
+        shards.check(path, shards.load(path)[1], header)
+        return True
+    return is_of(path, header)
+
+
+def is_of(path: Path, header: Mapping[str, Any]) -> bool:
+    """Whether a sweep is of the policy that a header names: it is stale if the run was trained on
+    since. One of before there were headers is taken to be; one that cannot be read is not."""
+    try:
+        found = records.header_of(records.load_arrays(path))
+    except records.RecordError:
+        return False
+    return bool(found.get("policy", header["policy"]) == header["policy"])
 
 
 def _sweep_one(
@@ -444,36 +492,40 @@ def _sweep_one(
     path: Path,
     asked: Job,
     config: SweepConfig,
+    header: Mapping[str, Any],
     runners: Runners,
     console: Console,
 ) -> None:
     """One policy's file, or a shard of it."""
     evaluator, policy = workspace.load_policy(folder, runners)
-    label, options = f"sweep {evaluator.method.name}", dict[str, Any]()
+    label = f"sweep {evaluator.method.name}"
     only = range(asked.episodes)
     if config.shard:
-        only, header = asked.part(shards.parse(config.shard)), _header(config, folder)
-        path.parent.mkdir(exist_ok=True)
-        options["save"] = lambda into, found: shards.save(into, vars(found), header)
+        only = asked.part(shards.parse(config.shard))
     with terminal.ProgressBar(console, len(only), label, unit="episode") as bar:
         asked.perform(
             path,
             evaluator,
             policy,
+            header=header,
             seed=config.seed,
-            aligned=workspace.quoted_variant(folder) == "aligned",
+            aligned=header["aligned"],
             only=only,
             progress=bar.advance,
-            **options,
+            other_versions=config.other_versions,
         )
     if config.shard:
         console.print(f"Shard {config.shard}: {path}", markup=False)
 
 
-def _header(config: SweepConfig, folder: Path) -> dict[str, Any]:
-    """The conditions of a run's sweep in which its shards must agree."""
+def header_of(config: SweepConfig, folder: Path) -> dict[str, Any]:
+    """The conditions of a run's sweep, in which its shards must agree.
+
+    Raises:
+      ConfigError: the run has no policy.
+    """
     stored = workspace.stored_config(folder)
-    best = checkpoint.best(folder / "checkpoints")
+    _, best = workspace.best_checkpoint(folder)
     return {
         "task": stored.task,
         "method": stored.method[0],
@@ -482,11 +534,6 @@ def _header(config: SweepConfig, folder: Path) -> dict[str, Any]:
         "seed": config.seed,
         "batch": config.batch,
         "aligned": workspace.quoted_variant(folder) == "aligned",
-        "policy": checkpoint.content_hash(best[0][1]) if best else None,
-        "versions": workspace.versions(),
+        "policy": checkpoint.content_hash(best),
+        "versions": versions.current(),
     }
-
-
-def _merged(config: SweepConfig, asked: Job, folder: Path, path: Path) -> Any:
-    arrays = shards.merge(path, asked.shape, asked.part, asked.grid, _header(config, folder))
-    return asked.record(**asked.grid, **arrays)

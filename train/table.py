@@ -31,7 +31,17 @@ from rich.console import Console
 
 from palm_jax.envs.registry import TASKS
 from palm_jax.envs.shifts import DOMAINS
-from palm_jax.train import compiled, interrupts, locks, methods, records, table_page, workspace
+from palm_jax.train import (
+    compiled,
+    interrupts,
+    locks,
+    methods,
+    records,
+    shards,
+    table_page,
+    versions,
+    workspace,
+)
 from palm_jax.train import config as configuration
 from palm_jax.train import console as terminal
 from palm_jax.train.config import Config, ConfigError
@@ -107,7 +117,8 @@ def cells(config: TableConfig) -> list[Cell]:
     next method's, palm and bc first.
 
     Raises:
-      ConfigError: an unknown preset, task or method, or a shard that is none.
+      ConfigError: an unknown preset, task or method.
+      ShardError: a shard that is none.
     """
     _check(config)
     order = [*_FIRST, *[name for name in config.methods if name not in _FIRST]]
@@ -118,7 +129,7 @@ def cells(config: TableConfig) -> list[Cell]:
         for seed in config.seeds
         for task in config.tasks
     ]
-    index, count = _shard(config.shard)
+    index, count = shards.parse(config.shard)
     return every[index - 1 :: count]
 
 
@@ -141,13 +152,6 @@ def _check(config: TableConfig) -> None:
             raise ConfigError(f"{name}: expected one or more, each once, got {values}")
 
 
-def _shard(text: str) -> tuple[int, int]:
-    index, _, count = text.partition("/")
-    if index.isdigit() and count.isdigit() and 1 <= int(index) <= int(count):
-        return int(index), int(count)
-    raise ConfigError(f"shard: expected i/n with i from 1 to n, got {text!r}")
-
-
 def cell_config(config: TableConfig, cell: Cell) -> Config:
     """The training command of a cell."""
     return dataclasses.replace(
@@ -168,7 +172,7 @@ def cell_config(config: TableConfig, cell: Cell) -> Config:
 def header(config: TableConfig) -> dict[str, Any]:
     """The conditions under which the cells of a file were made."""
     preset = configuration.PRESETS[config.preset]()
-    found = workspace.environment(preset, wall_s=0.0)
+    found = workspace.environment(preset)
     recipe = {name: getattr(preset, name) for name in _KEPT} | {"other_robot": preset.second_robot}
     return {
         "preset": config.preset,
@@ -195,7 +199,7 @@ def read(path: Path, fresh: dict[str, Any]) -> dict[str, Any]:
       ConfigError: it was made under other conditions; the message names the field.
     """
     if not path.exists():
-        return {"header": fresh, "results": {}, "failed": {}}
+        return {"header": {**fresh}, "results": {}, "failed": {}}
     try:
         table: dict[str, Any] = records.load_json(path)
     except records.RecordError as error:
@@ -252,7 +256,7 @@ def run(config: TableConfig, console: Console) -> Path:
     """Runs what is missing; returns the file.
 
     Raises:
-      ConfigError: see `cells` and `read`.
+      ConfigError, ShardError: see `cells`, `read` and `_merge`.
       KeyboardInterrupt: the running cell was stopped; it resumes from its last checkpoint.
     """
     asked, fresh = cells(config), header(config)
@@ -309,24 +313,75 @@ def _whole(folder: Path, console: Console) -> bool:
 def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
     """What a finished cell left in its folder, into the table and the file beside it."""
     folder = config.folder / cell.name
+    _check_versions(table["header"], folder)
+    _note_demonstrations(table["header"], {cell.task: _trained_on(folder)}, folder)
     _keep_episodes(config.file, {cell: records.load_eval(folder / "eval.npz")})
     _put(table, "results", cell, records.load_counts(folder / "eval.json"))
     _drop(table, "failed", cell)
-    if (folder / "times.json").exists():
-        _put(table, "times", cell, records.load_json(folder / "times.json"))
+    times = records.load_notes(folder / "times.json")
+    if _took(times):
+        _put(table, "times", cell, times)
     _note_speed(table)
+
+
+def _check_versions(header: Mapping[str, Any], folder: Path) -> None:
+    """Raises ConfigError for a cell that was worked on under other versions than the table's."""
+    path = folder / "env.json"
+    for entry in records.load_sessions(path) if path.exists() else []:
+        if found := versions.difference(entry.get("versions"), header["versions"]):
+            name, old, new = found
+            raise ConfigError(
+                f"{folder} was made with {name} {old}, the table with {new}: results of two kinds "
+                "are not mixed. Move the folder away to run the cell again, or choose another "
+                "--json and --out"
+            )
+
+
+def _trained_on(folder: Path) -> str | None:
+    """SHA-256 of a cell's demonstrations; None if nothing of it was noted."""
+    digests = records.load_notes(folder / "config.json").get(workspace.DIGESTS)
+    return digests.get(workspace.DEMONSTRATIONS) if isinstance(digests, dict) else None
+
+
+def _note_demonstrations(
+    header: dict[str, Any], found: Mapping[str, str | None], where: Path
+) -> None:
+    """Adds the SHA-256 of tasks' demonstrations to a header.
+
+    Raises:
+      ConfigError: it has others; the task is named.
+    """
+    known = header.setdefault(workspace.DEMONSTRATIONS, {})
+    for task, digest in found.items():
+        if digest is not None and known.setdefault(task, digest) != digest:
+            raise ConfigError(
+                f"{where}: demonstrations of {task} with SHA-256 {digest[:12]}, but the table was "
+                f"begun with {known[task][:12]}: results of two kinds are not mixed. Give all "
+                "shards the same OUT/demos, or choose another --json and --out"
+            )
+
+
+def _took(times: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Seconds of training and of the evaluation, from a cell's times.json; None if one of them is
+    not known: a process that is killed after its results are written leaves no time for them."""
+    training, selection, evaluation = (
+        records.seconds(times, f"{name}_s")
+        for name in ("training_and_selection", "selection", "evaluation")
+    )
+    training = None if training is None else training - (selection or 0.0)
+    return (training, evaluation) if training and training > 0 and evaluation is not None else None
 
 
 def _note_speed(table: dict[str, Any]) -> None:
     """Medians over the cells, into the header: samples a second, seconds of an evaluation."""
-    times = [t for cell in _cells_of(table, "times") if (t := _get(table, "times", cell))]
+    every = (_get(table, "times", cell) or {} for cell in _cells_of(table, "times"))
+    took = list(filter(None, map(_took, every)))
     recipe, header = table["header"]["recipe"], table["header"]
-    samples = recipe["steps"] * recipe["batch_size"]
-    training = [t["training_and_selection_s"] - t.get("selection_s", 0.0) for t in times]
-    if training:
-        header["samples_per_second"] = round(samples / statistics.median(training), 1)
-        seconds = statistics.median(t["evaluation_s"] for t in times)
-        header["evaluation_seconds"] = round(seconds, 1)
+    if took:
+        training, evaluation = map(statistics.median, zip(*took, strict=True))
+        samples = recipe["steps"] * recipe["batch_size"]
+        header["samples_per_second"] = round(samples / training, 1)
+        header["evaluation_seconds"] = round(evaluation, 1)
 
 
 def _keep_episodes(table: Path, fresh: Mapping[Cell, Mapping[str, records.DomainRecord]]) -> None:
@@ -407,20 +462,52 @@ def _environment() -> dict[str, str]:
     return {**ours, **os.environ}
 
 
-def _merge(table: dict[str, Any], path: Path, fresh: dict[str, Any]) -> list[Cell]:
-    """Takes over what only the other file has; returns the cells that came with results."""
-    other, taken = read(path, fresh), []
+def _merge(
+    table: dict[str, Any], path: Path, fresh: dict[str, Any]
+) -> dict[Cell, Mapping[str, records.DomainRecord]]:
+    """Takes over what only the other file has; returns the episodes of the cells that came with
+    results.
+
+    Raises:
+      ConfigError: there is no such file, or one of other conditions.
+      RecordError: a cell's episodes are missing, or others than its counts say.
+    """
+    if not path.exists():
+        raise ConfigError(
+            f"merge: expected the JSON file of a shard, got {path}, which is not there"
+        )
+    other, beside = read(path, fresh), _episodes_of(path)
+    taken: dict[Cell, Mapping[str, records.DomainRecord]] = {}
+    demonstrations = other["header"].get(workspace.DEMONSTRATIONS, {})
+    _note_demonstrations(table["header"], demonstrations, path)
     for cell in _cells_of(other, "results"):
         if _get(table, "results", cell) is None:
-            _put(table, "results", cell, _get(other, "results", cell))
+            counts = _get(other, "results", cell)
+            records.compare_counts(f"{path}: {cell.name}", counts, beside.get(cell, {}))
+            _put(table, "results", cell, counts)
             _put(table, "times", cell, _get(other, "times", cell) or {})
             _drop(table, "failed", cell)
-            taken.append(cell)
+            taken[cell] = beside.get(cell, {})
     for cell in _cells_of(other, "failed"):
         if _get(table, "results", cell) is None:
             _put(table, "failed", cell, _get(other, "failed", cell))
     _note_origin(table["header"], other["header"])
     return taken
+
+
+def _episodes_of(table: Path) -> dict[Cell, dict[str, records.DomainRecord]]:
+    """The episodes beside a table, by cell and domain; empty where there is no such file."""
+    path = table_page.episodes_file(table)
+    found: dict[Cell, dict[str, records.DomainRecord]] = {}
+    for name, record in (records.load_eval(path) if path.exists() else {}).items():
+        try:
+            task, method, seed, domain = name.split("/")
+            found.setdefault(Cell(task, method, int(seed)), {})[domain] = record
+        except ValueError as error:
+            raise records.RecordError(
+                f"{path}: expected arrays named TASK/METHOD/SEED/DOMAIN/..., got {name!r}"
+            ) from error
+    return found
 
 
 def _note_origin(header: dict[str, Any], other: dict[str, Any]) -> None:
@@ -431,15 +518,11 @@ def _note_origin(header: dict[str, Any], other: dict[str, Any]) -> None:
 
 
 def _merge_all(config: TableConfig, table: dict[str, Any], fresh: dict[str, Any]) -> None:
+    taken: dict[Cell, Mapping[str, records.DomainRecord]] = {}
     for path in config.merge:
-        taken = _merge(table, path, fresh)
-        episodes: dict[Cell, dict[str, records.DomainRecord]] = {}
-        beside = table_page.episodes_file(path)
-        for name, record in (records.load_eval(beside) if beside.exists() else {}).items():
-            task, method, seed, domain = name.split("/")
-            episodes.setdefault(Cell(task, method, int(seed)), {})[domain] = record
-        _keep_episodes(config.file, {cell: episodes[cell] for cell in taken if cell in episodes})
+        taken |= _merge(table, path, fresh)
     _note_speed(table)
+    _keep_episodes(config.file, taken)
     _store(config.file, table)
 
 
@@ -462,7 +545,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         with interrupts.raising():
             path = run(config, console)
-    except (ConfigError, compiled.CacheError, records.RecordError, OSError) as error:
+    except (
+        ConfigError, compiled.CacheError, shards.ShardError, records.RecordError, OSError,
+    ) as error:  # fmt: skip
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as stop:

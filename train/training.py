@@ -5,16 +5,25 @@ What is trained on, and what makes one checkpoint better than another, is the ca
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 from rich.console import Console
 
 from palm_jax.align import procedural_bank
-from palm_jax.train import checkpoint, debug, devices, interrupts, learner, pictures, records
+from palm_jax.train import (
+    checkpoint,
+    debug,
+    devices,
+    interrupts,
+    learner,
+    pictures,
+    records,
+    workspace,
+)
 from palm_jax.train import console as terminal
 from palm_jax.train.config import Learning
 from palm_jax.train.metrics import MetricsLog, write_json
@@ -35,6 +44,14 @@ class Score(NamedTuple):
     logged: dict[str, float]  # what the log of the training says of it
 
 
+class _Begun(NamedTuple):
+    """A checkpoint to go on from."""
+
+    step: int
+    path: Path
+    state: learner.TrainState
+
+
 @dataclasses.dataclass(frozen=True)
 class Training:
     """One policy's training.
@@ -43,8 +60,7 @@ class Training:
       config: steps, seed, checkpoints.
       name: of the method.
       model: what is trained.
-      folder: of the run.
-      belongs: fingerprint of the run; checkpoints of others are not used.
+      folder: of the run; its config.json tells its checkpoints from others'.
       score: of a checkpoint (step, state); None where it is not to be scored.
       augment: whether images are augmented, which takes backgrounds.
     """
@@ -53,7 +69,6 @@ class Training:
     name: str
     model: learner.Learner
     folder: Path
-    belongs: str
     score: Callable[[int, learner.TrainState], Score | None]
     augment: bool
 
@@ -61,11 +76,14 @@ class Training:
         """Trains from the newest valid checkpoint, or from the start, to the last step.
 
         Raises:
+          ConfigError: begun under other versions.
           Interrupted: stopped on request.
           NonFiniteError: see `learner.run`; the message names a dump.
         """
         config, store = self.config, self.folder / "checkpoints"
-        state, done = self._resumed(console)
+        fingerprint = workspace.fingerprints(self.folder)[0]
+        begun = self._begun(console)
+        done = begun.step if begun else 0
         dumped = debug.dumping(self.folder / debug.DUMPS, self.model)
         stop = interrupts.Stop(PROMISE)
         together = devices.Together(stop)
@@ -86,13 +104,12 @@ class Training:
                 meta = {
                     "method": self.name,
                     "task": config.task,
-                    checkpoint.FINGERPRINT: self.belongs,
+                    checkpoint.FINGERPRINT: fingerprint,
                 }
+                log.sync()  # a checkpoint on the disk has its log there
                 path = checkpoint.save(store, step, state, meta, keep=config.keep)
-                if not (stop() or together.agreed):
-                    found = self._score_if_missing(path, step, state)
-                    if found is not None:
-                        log.write(step, found.logged)
+                if not together.agreed:
+                    self._score_if_missing(path, step, state, log)
                 devices.wait()
 
             def on_failure(failure: learner.Failure) -> None:
@@ -100,11 +117,13 @@ class Training:
                 devices.wait()
 
             with timed(self.folder, "training_and_selection_s"), dumped as dump:
+                if begun:
+                    self._score_if_missing(begun.path, done, begun.state, log)
                 learner.run(
                     self.model,
                     data,
                     seed=config.seed,
-                    state=state,
+                    state=begun.state if begun else None,
                     bank=backgrounds(config) if self.augment else None,
                     log_every=LOG_EVERY,
                     on_log=on_log,
@@ -117,27 +136,48 @@ class Training:
         if together.agreed:
             raise Interrupted
 
-    def _resumed(self, console: Console) -> tuple[learner.TrainState | None, int]:
-        """The newest valid checkpoint, scored, and its step; None and 0 if there is none."""
-        found = checkpoint.latest_valid(self.folder / "checkpoints", fingerprint=self.belongs)
-        if not found:
-            return None, 0
-        done, path = found
-        state = checkpoint.load(path, self.model.abstract_state())
-        if done < self.config.steps:
-            terminal.resumed(console, f"{self.name}, step {done} of {self.config.steps}")
-        self._score_if_missing(path, done, state)
-        return state, done
+    def _begun(self, console: Console) -> "_Begun | None":
+        """Where the training goes on: the newest valid checkpoint, if there is one.
 
-    def _score_if_missing(self, path: Path, step: int, state: learner.TrainState) -> Score | None:
-        """The score of a checkpoint, written into its meta data; None if it is not scored now."""
-        if checkpoint.SCORE in checkpoint.read_meta(path):
+        Raises:
+          ConfigError: it was written under other versions.
+        """
+        found = checkpoint.latest_valid(
+            self.folder / "checkpoints", fingerprints=workspace.fingerprints(self.folder)
+        )
+        if not found:
             return None
+        step, path = found
+        workspace.check_versions(
+            path,
+            checkpoint.versions_of(path),
+            allowed=self.config.other_versions,
+            instead="choose another --out",
+        )
+        state = checkpoint.load(path, self.model.abstract_state())
+        if step < self.config.steps:
+            terminal.resumed(console, f"{self.name}, step {step} of {self.config.steps}")
+        return _Begun(step, path, state)
+
+    def _score_if_missing(
+        self, path: Path, step: int, state: learner.TrainState, log: MetricsLog
+    ) -> None:
+        """Writes the score of a checkpoint into the log and then into its meta data.
+
+        One that a stop has left between two others is never scored: a training that was interrupted
+        chooses among the checkpoints of one that was not.
+        """
+        if step % self.config.checkpoint_every and step != self.config.steps:
+            return
+        if checkpoint.SCORE in checkpoint.read_meta(path):
+            return
         with timed(self.folder, "selection_s"):
             found = self.score(step, state)
         if found is not None:
+            # Killed in between, the checkpoint is scored again, to the same row.
+            log.write_once(step, found.logged)
+            log.sync()
             checkpoint.update_meta(path, **{checkpoint.SCORE: found.rank})
-        return found
 
 
 def backgrounds(config: Learning) -> jax.Array:
@@ -155,14 +195,6 @@ def timed(folder: Path, what: str) -> Iterator[None]:
         yield
     finally:
         path = folder / "times.json"
-        times = dict(noted(path))
-        times[what] = round(times.get(what, 0.0) + time.monotonic() - start, 2)
-        write_json(path, times)
-
-
-def noted(path: Path) -> Mapping[str, Any]:
-    """What a file of notes holds, nothing if it is absent or damaged: no result rests on it."""
-    try:
-        return records.load_json(path)
-    except records.RecordError:
-        return {}
+        times = dict(records.load_notes(path))
+        earlier = records.seconds(times, what) or 0.0
+        write_json(path, {**times, what: round(earlier + time.monotonic() - start, 2)})

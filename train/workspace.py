@@ -9,10 +9,11 @@ import platform
 import shlex
 import subprocess
 import tempfile
+import time
 import types
 import typing
-from collections.abc import Mapping
-from importlib import metadata
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -20,37 +21,39 @@ import jax
 
 from palm_jax.envs import shifts
 from palm_jax.envs.registry import TASKS
-from palm_jax.train import checkpoint, methods, records
+from palm_jax.train import checkpoint, methods, pictures, records, versions
 from palm_jax.train.config import AnyConfig, Config, ConfigError, Learning, command
 from palm_jax.train.evaluate import VIEW, Evaluator, Runners
 from palm_jax.train.learner import Learner, PolicyState, make_learner
 from palm_jax.train.metrics import write_json
 
-_PACKAGES = (
-    "palm_jax",
-    "jax",
-    "jaxlib",
-    "flax",
-    "optax",
-    "orbax-checkpoint",
-    "mujoco",
-    "mujoco-mjx",
-    "numpy",
-)
 _FREE = ("out", "resume", "data", "calibration", "sweep", "videos", "method")
 """Fields in which a resumed command may differ from the one that began."""
 
 RECORDED = "recorded"
 """What config.json says under "kind" of a run on recordings; nothing of one in the simulator."""
 
-NOT_STORED = ("distributed", "take_over")
-"""Fields of the machines alone: no run folder holds them."""
+DIGESTS = "digests"
+"""Where config.json has the SHA-256 of the data that the run was begun with, by what they are."""
+
+DEMONSTRATIONS = "demonstrations"
+"""One of them."""
+
+_NOT_STORED = ("distributed", "take_over", "other_versions")
+"""Fields of one session alone: no run folder holds them."""
+
+
+def options(config: Learning) -> dict[str, Any]:
+    """Those of a command that a run folder holds."""
+    return {name: getattr(config, name) for name in _stored_names(type(config))}
+
+
+def _stored_names(kind: type[Learning]) -> list[str]:
+    return [f.name for f in dataclasses.fields(kind) if f.name not in _NOT_STORED]
 
 
 def stored(config: Config, method: str) -> dict[str, Any]:
     """What `config.json` of one method's run folder holds."""
-    names = [f.name for f in dataclasses.fields(Config) if f.name not in NOT_STORED]
-    values = {name: getattr(config, name) for name in names}
     low, high = shifts.TEST_LOW, shifts.TEST_HIGH
     regions = {
         "train_x": (0.15, 0.35),
@@ -60,7 +63,7 @@ def stored(config: Config, method: str) -> dict[str, Any]:
         "test_angle": shifts.MAX_CAMERA_ANGLE,
     }
     return {
-        **values,
+        **options(config),
         "other_robot": config.second_robot,
         "method": method,
         "frame": f"{methods.find(method).frame} px",
@@ -86,6 +89,7 @@ def begin_run(values: Mapping[str, Any], folder: Path, *, resume: bool) -> None:
       ConfigError: the folder holds another run, or holds one and `resume` was not asked for.
     """
     path, fresh = folder / "config.json", json.loads(json.dumps(values, default=str))
+    assert isinstance(fresh, dict)
     if path.exists():
         try:
             old = records.load_json(path)
@@ -98,6 +102,8 @@ def begin_run(values: Mapping[str, Any], folder: Path, *, resume: bool) -> None:
             raise ConfigError(
                 f"{folder} holds a run already: add --resume to go on, or choose another --out"
             )
+        if DIGESTS in old:
+            fresh[DIGESTS] = old[DIGESTS]  # compared when the data are opened: `bind_data`
         for name in sorted(set(old) | set(fresh)):
             if name not in _FREE and old.get(name) != fresh.get(name):
                 raise ConfigError(
@@ -107,44 +113,102 @@ def begin_run(values: Mapping[str, Any], folder: Path, *, resume: bool) -> None:
     write_json(path, fresh)
 
 
-def fingerprint(config: Config, method: str) -> str:
-    """Of all options that a run must keep: what its checkpoints are told by from others'."""
-    return fingerprint_of(stored(config, method))
+def bind_data(folder: Path, name: str, digest: str, path: Path | None) -> None:
+    """Notes in `config.json` what a run is trained on, or checks that it is the same as before.
+
+    Args:
+      folder: of the run.
+      name: what the data are.
+      digest: SHA-256 of them.
+      path: where they are, for the message.
+
+    Raises:
+      ConfigError: the run was begun with others.
+    """
+    values = records.load_json(folder / "config.json")
+    found = values.get(DIGESTS)
+    known = found if isinstance(found, dict) else {}
+    if known.get(name, digest) != digest:
+        raise ConfigError(
+            f"{folder} was begun with {name} of SHA-256 {str(known[name])[:12]}, but {path} has "
+            f"{digest[:12]}: resume with the old ones, or choose another --out"
+        )
+    if name not in known:
+        write_json(folder / "config.json", {**values, DIGESTS: {**known, name: digest}})
 
 
-def fingerprint_of(values: Mapping[str, Any]) -> str:
-    """`fingerprint` of what `config.json` holds."""
+def bind_backgrounds(folder: Path, config: Learning, method: methods.Method) -> None:
+    """`bind_data` for the user's own backgrounds, where the method has any use of them."""
+    if config.backgrounds is not None and method.augment:
+        digest = pictures.digest(config.backgrounds)
+        bind_data(folder, "backgrounds", digest, config.backgrounds)
+
+
+def fingerprints(folder: Path) -> tuple[str, ...]:
+    """What a run's checkpoints are told by from others': a hash of all that a run must keep, as
+    config.json has it. After the run's own comes that of one whose data were not noted."""
+    values = records.load_json(folder / "config.json")
     kept = {name: value for name, value in values.items() if name not in _FREE}
-    text = json.dumps({**kept, "method": values["method"]}, default=str, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+    kept["method"] = values.get("method")
+    old = {name: value for name, value in kept.items() if name != DIGESTS}
+    return tuple(
+        hashlib.sha256(json.dumps(each, sort_keys=True).encode()).hexdigest()
+        for each in (kept, old)
+    )
 
 
-def environment(config: Learning, *, wall_s: float) -> dict[str, Any]:
-    """What `env.json` holds: where, when and with what."""
+@contextmanager
+def session(config: Learning, folder: Path) -> Iterator[dict[str, Any]]:
+    """Around work in a run folder: adds an entry to `env.json` that says where, when and with what.
+
+    Yields the entry; what is put into it is noted at the end. One without `wall_s` is of a process
+    that was killed.
+    """
+    path, start = folder / "env.json", time.monotonic()
+    try:
+        earlier = records.load_sessions(path) if path.exists() else []
+    except records.RecordError:
+        earlier = []  # no result rests on it
+    now = environment(config)
+    write_json(path, {"sessions": [*earlier, now]})
+    try:
+        yield now
+    finally:
+        now["wall_s"] = round(time.monotonic() - start, 1)
+        write_json(path, {"sessions": [*earlier, now]})
+
+
+def check_versions(where: object, noted: Any, *, allowed: bool, instead: str) -> None:
+    """What was begun under other versions is not gone on with, unless that is `allowed`.
+
+    Args:
+      where: what was begun.
+      noted: what it says of its versions.
+      instead: what else can be done.
+
+    Raises:
+      ConfigError: the first package that differs is named.
+    """
+    found = None if allowed else versions.difference(noted, versions.current())
+    if found:
+        name, old, new = found
+        raise ConfigError(
+            f"{where} was begun with {name} {old}, now it is {new}: install the old version, "
+            f"{instead}, or go on with --other-versions, which env.json or the header then tells"
+        )
+
+
+def environment(config: Learning) -> dict[str, Any]:
+    """An entry of `env.json`."""
     return {
         "command": shlex.join(command(config)),
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}",
         "devices": [str(device) for device in jax.devices()],
-        "versions": versions(),
+        "versions": versions.current(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
         "commit": commit(),
-        "wall_s": round(wall_s, 1),
     }
-
-
-def versions() -> dict[str, str]:
-    """Those of Python and of the packages that decide what comes out."""
-    found = {name: metadata.version(name) for name in _PACKAGES if _installed(name)}
-    return found | {"python": platform.python_version()}
-
-
-def _installed(name: str) -> bool:
-    try:
-        metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return False
-    return True
 
 
 def _processor() -> str:
@@ -213,7 +277,7 @@ def config_in(folder: Path, kind: type[AnyConfig]) -> AnyConfig:
     """
     path = folder / "config.json"
     values = records.load_json(path)
-    names = [f.name for f in dataclasses.fields(kind) if f.name not in NOT_STORED]
+    names = _stored_names(kind)
     missing = sorted(set(names) - set(values))
     if missing:
         raise ConfigError(f"{path} lacks {', '.join(missing)}: another version's run")
@@ -273,28 +337,26 @@ def load_policy(folder: Path, runners: Runners) -> tuple[Evaluator, PolicyState]
     """
     config = stored_config(folder)
     evaluator = make_evaluator(config, methods.find(config.method[0]), runners)
-    belongs = fingerprint(config, config.method[0])
-    return evaluator, best_policy(folder, evaluator.learner, belongs)
+    return evaluator, best_policy(folder, evaluator.learner)
 
 
-def best_policy(folder: Path, learner: Learner, belongs: str | None = None) -> PolicyState:
-    """Parameters of the best checkpoint in `folder/checkpoints`; of those of a `fingerprint`.
+def best_policy(folder: Path, learner: Learner) -> PolicyState:
+    """Parameters of the best checkpoint of a run.
 
     Raises:
       ConfigError: there is none.
     """
-    _, path = best_checkpoint(folder, belongs)
+    _, path = best_checkpoint(folder)
     return learner.policy_state(checkpoint.load(path, learner.abstract_state()))
 
 
-def best_checkpoint(folder: Path, belongs: str | None = None) -> tuple[int, Path]:
-    """(step, path) of the checkpoint in `folder/checkpoints` with the best in-domain success; of
-    those of a `fingerprint`.
+def best_checkpoint(folder: Path) -> tuple[int, Path]:
+    """(step, path) of the checkpoint of a run with the best in-domain success.
 
     Raises:
       ConfigError: there is none.
     """
-    best = checkpoint.best(folder / "checkpoints", fingerprint=belongs)
+    best = checkpoint.best(folder / "checkpoints", fingerprints=fingerprints(folder))
     if not best:
         raise ConfigError(f"{folder}/checkpoints holds no whole, scored checkpoint: train first")
     return best[0]

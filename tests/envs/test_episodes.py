@@ -206,6 +206,25 @@ def test_divergence_is_counted_and_never_a_success(task: str) -> None:
             assert np.isfinite(leaf).all()
 
 
+def test_what_happens_after_success_does_not_count() -> None:
+    """A solved world is stepped until the slowest of its batch has ended: it diverges meanwhile."""
+    runner = worlds.runner("lift_spam")
+    params = worlds.params(runner.env, "workspace")
+    states = worlds.expert_episodes("lift_spam")[0]
+    state = jax.tree.map(lambda x: jnp.asarray(x[-1]), states)
+    solved = np.array(state.success)
+    assert solved.sum() > worlds.WORLDS // 2
+    state = dataclasses.replace(state, success=state.success.at[0].set(False))
+    solved[0] = False
+    qvel = jnp.full_like(state.data.qvel, 1e30)
+    state = dataclasses.replace(state, data=state.data.replace(qvel=qvel))
+    for _ in range(2):
+        state = runner.step(state, jnp.full((worlds.WORLDS, 10), jnp.nan), params)
+        np.testing.assert_array_equal(state.success, solved)
+        np.testing.assert_array_equal(state.nan, ~solved)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
+
+
 def test_nan_in_velocities_or_actions_is_divergence() -> None:
     runner = worlds.runner("lift_spam")
     params = worlds.params(runner.env)

@@ -14,8 +14,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 
 class Outcome(NamedTuple):
     """A row of the campaign's table."""
@@ -133,15 +131,6 @@ def small_disk(folder: Path, *, size: str = "160k") -> Iterator[Callable[..., No
 def logged(path: Path) -> list[dict[str, Any]]:
     """The lines of a log."""
     return [json.loads(line) for line in path.read_text().splitlines()]
-
-
-def same_arrays(one: Path, other: Path) -> None:
-    """Two .npz files hold the same bytes."""
-    with np.load(one) as left, np.load(other) as right:
-        assert sorted(left.files) == sorted(right.files)
-        for name in left.files:
-            assert left[name].dtype == right[name].dtype, name
-            assert left[name].tobytes() == right[name].tobytes(), name
 
 
 def identifier(found: Case) -> str:

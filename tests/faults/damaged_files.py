@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import hashlib
 import io
 import json
 import logging
@@ -83,6 +84,7 @@ def _foreign(path: Path) -> None:
 
 
 def _half_written(path: Path) -> None:
+    _manifest(path).unlink()  # it comes last
     path.rename(path.with_name(f"{checkpoint.SAVING}200-{2**22 + 1}"))
 
 
@@ -97,6 +99,13 @@ def _changed_score(path: Path) -> None:
 
 def _other_version(path: Path) -> None:
     _manifest(path).write_text(json.dumps({"format": checkpoint.FORMAT, "version": 99}))
+
+
+def _forged(path: Path) -> None:
+    content = json.loads(_manifest(path).read_text())
+    del content["files"], content["checksum"]
+    checksum = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    _manifest(path).write_text(json.dumps({**content, "checksum": checksum}))
 
 
 _HARMS: tuple[tuple[str, Callable[[Path], Any], str | None], ...] = (
@@ -120,6 +129,7 @@ _HARMS: tuple[tuple[str, Callable[[Path], Any], str | None], ...] = (
     ("the manifest is no text", lambda p: _manifest(p).write_bytes(b"\xff\x00"), "bad-manifest"),
     ("the score in the manifest is changed", _changed_score, "bad-manifest"),
     ("the manifest is of a later version", _other_version, "unknown-format"),
+    ("the manifest has a right checksum, but no files", _forged, "bad-manifest"),
     ("its writer was killed before the end", _half_written, "unfinished"),
     ("its remover was killed before the end", _half_removed, None),
 )
@@ -130,7 +140,7 @@ def _damaged_checkpoint(folder: Path, harm: Callable[[Path], Any], reason: str |
     harm(store / "200")
     older, told = snapshot(store / "100"), _Told()
     with told:
-        found = checkpoint.latest_valid(store, fingerprint="mine")
+        found = checkpoint.latest_valid(store, fingerprints=["mine"])
     assert found == (100, store / "100") and snapshot(store / "100") == older
     loaded = checkpoint.load(found[1], TREE)
     assert loaded["w"].tobytes() == TREE["w"].tobytes() and int(loaded["step"]) == 100
@@ -160,6 +170,16 @@ class _Told(logging.Handler):
 
 for _name, _harm, _reason in _HARMS:
     case("checkpoint", _name, harm=_harm, reason=_reason)(_damaged_checkpoint)
+
+
+@case("checkpoint", "its writer was killed before it gave it its name")
+def _nameless(folder: Path) -> Outcome:
+    store = shutil.copytree(_saved(), folder / "checkpoints")
+    whole = snapshot(store)
+    (store / "200").rename(store / f"{checkpoint.SAVING}200-{2**22 + 1}")
+    assert checkpoint.latest_valid(store, fingerprints=["mine"]) == (200, store / "200")
+    assert snapshot(store) == whole
+    return Outcome("whole: it is given its name, and used")
 
 
 @case("checkpoint", "every one is damaged")
@@ -275,7 +295,7 @@ def _damaged_sweep(folder: Path, shift: str, harm: Callable[[Path], Any]) -> Out
     path = records.sweep_path(folder, shift=shift)
     if shift:
         curve = records.StrengthSweep(shift, np.arange(2.0), cells[:, 0, 0], cells[:, 0, 0])
-        records.save_strengths(path, curve)
+        records.save_sweep(path, curve)
     else:
         records.save_sweep(
             path, records.Sweep(np.arange(2.0), np.ones(1), np.ones(1), cells, cells)
@@ -321,10 +341,12 @@ def _damaged_line(folder: Path) -> Outcome:
 
 @case("results", "times.json and env.json are damaged")
 def _damaged_notes(folder: Path) -> Outcome:
-    (folder / "times.json").write_text("{")
-    with training.timed(folder, "evaluation_s"):
-        pass
-    assert set(records.load_json(folder / "times.json")) == {"evaluation_s"}
+    for left in ("{", '{"evaluation_s": null}', '{"evaluation_s": [1]}'):
+        (folder / "times.json").write_text(left)
+        with training.timed(folder, "evaluation_s"):
+            pass
+        (found,) = records.load_json(folder / "times.json").items()
+        assert found[0] == "evaluation_s" and 0 <= found[1] < 60
     return Outcome("begun anew: no result rests on them", "timings")
 
 

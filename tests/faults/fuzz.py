@@ -108,7 +108,7 @@ def _sweep_npz(folder: Path) -> Path:
 def _strength_npz(folder: Path) -> Path:
     cells = np.random.default_rng(0).random((4, 5)) < 0.5
     curve = records.StrengthSweep("lighting", np.arange(4.0), cells, ~cells)
-    return records.save_strengths(folder / "strength-lighting.npz", curve)
+    return records.save_sweep(folder / "strength-lighting.npz", curve)
 
 
 def _metrics(folder: Path) -> Path:

@@ -13,8 +13,9 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+import play
 from faults import workers
-from faults.cases import Outcome, case, logged, same_arrays
+from faults.cases import Outcome, case, logged
 
 from palm_jax.train import checkpoint, interrupts, records, table, table_page
 
@@ -104,8 +105,7 @@ def _training(folder: Path) -> Outcome:
     count = kill_at_random(workers.train, killed, pieces=8, after=after)
     assert count == KILLS, f"only {count} kills before the end: more steps are needed"
     assert max(lost) <= workers.EVERY, lost
-    same_arrays(expected / "final.npz", killed / "final.npz")
-    assert logged(expected / "metrics.jsonl") == logged(killed / "metrics.jsonl")
+    play.assert_same(expected, killed)
     aside = killed / "checkpoints" / "damaged"
     halves = len(list(aside.iterdir())) if aside.is_dir() else 0
     return Outcome(
@@ -199,12 +199,12 @@ def _asked_to_stop(folder: Path, number: signal.Signals) -> Outcome:
     os.kill(process.pid or 0, number)
     process.join()
     assert process.exitcode == 130, (stopped / "output").read_text()[-3000:]
-    assert "Stopping after this step" in (stopped / "output").read_text()
+    assert "Stopping after this update" in (stopped / "output").read_text()
     last = logged(stopped / "metrics.jsonl")[-1]["step"]
     found = checkpoint.latest_valid(stopped / "checkpoints")
     assert found is not None and found[0] == last < workers.STEPS
     whole(workers.train, stopped)
-    same_arrays(expected / "final.npz", stopped / "final.npz")
+    play.assert_same(expected, stopped)
     return Outcome("saves, says so and ends; goes on to the same bytes")
 
 
@@ -228,14 +228,13 @@ def _asked_twice(folder: Path) -> Outcome:
     took = time.monotonic() - begin
     assert process.exitcode == 128 + signal.SIGINT and took < 2, (process.exitcode, took)
     whole(workers.train, stopped)
-    same_arrays(expected / "final.npz", stopped / "final.npz")
+    play.assert_same(expected, stopped)
     return Outcome("ends at once; goes on to the same bytes", "at most one interval, repeated")
 
 
 @case("determinism", "the same training twice", long=True)
 def _twice(folder: Path) -> Outcome:
     one, other = (whole(workers.train, folder / name) for name in ("one", "other"))
-    same_arrays(one / "final.npz", other / "final.npz")
-    assert (one / "metrics.jsonl").read_bytes() == (other / "metrics.jsonl").read_bytes()
+    play.assert_same(one, other)
     shutil.rmtree(one)
     return Outcome("the same bytes, log and all")

@@ -6,14 +6,18 @@ from typing import Any
 
 import jax
 import numpy as np
+import play
 import rooms
-from faults import workers
 from faults.cases import Outcome, case, refused
 
 from palm_jax.envs.rollout import repeat_params
 from palm_jax.train import debug, evaluate, learner, records, sweep
 
 POLICY: Any = None
+SIDE = 24
+CONFIG = play.small(
+    learner.LearnerConfig(width=2, crop=20, batch_size=4, steps=100, warmup_steps=4, ema=0.9)
+)
 
 
 @case("numerics", "an episode's physics goes non-finite")
@@ -34,10 +38,10 @@ for _name in ("proprio", "actions"):
 
     @case("numerics", f"{_name} of the data has an infinity", field=_name)
     def _infinite_data(folder: Path, field: str) -> Outcome:
-        data = workers.data()
+        data = play.samples(SIDE)
         values = np.array(getattr(data, field))
         values[3, 1] = np.inf
-        model = learner.make_learner(workers.CONFIG, 3)
+        model = learner.make_learner(CONFIG, play.PROPRIO)
         with refused(ValueError, f"{field} has non-finite values"):
             learner.run(model, dataclasses.replace(data, **{field: values}), seed=0)
         return Outcome("refused before anything is compiled")
@@ -45,15 +49,16 @@ for _name in ("proprio", "actions"):
 
 @case("numerics", "updates keep going non-finite", long=True)
 def _bad_updates(folder: Path) -> Outcome:
-    data = workers.data()
+    data = play.samples(SIDE)
     actions = np.array(data.actions) * np.float32(1e-3)
     actions[5:7, 6] = 3e38, -3e38  # finite, but not their distance
-    config = dataclasses.replace(workers.CONFIG, max_skipped_steps=3, ema=0.0)
-    model = learner.make_learner(config, 3)
+    config = dataclasses.replace(CONFIG, max_skipped_steps=3, ema=0.0)
+    model = learner.make_learner(config, play.PROPRIO)
     bad = dataclasses.replace(data, actions=actions)
     with refused(learner.NonFiniteError, "max_skipped_steps = 3", "debug replay"):
         with debug.dumping(folder, model) as on_failure:
-            learner.run(model, bad, seed=0, bank=workers.bank(), log_every=5, on_failure=on_failure)
+            bank = play.backgrounds(SIDE)
+            learner.run(model, bad, seed=0, bank=bank, log_every=5, on_failure=on_failure)
     (dump,) = folder.iterdir()
     lines = debug.replay(dump)
     assert "The first that is not finite is input/target" in lines[1], lines
@@ -84,7 +89,7 @@ def _too_many_in_a_sweep(folder: Path) -> Outcome:
     for fits in (16, 3):
         runner, _ = rooms.evaluator(16, fits=fits)
         path = folder / f"{fits}.npz"
-        job.perform(path, runner, POLICY, seed=0, aligned=True)
+        job.perform(path, runner, POLICY, header={}, seed=0, aligned=True)
         found.append(records.load_sweep(path))
     np.testing.assert_array_equal(found[0].success, found[1].success)
     assert [sweep.worlds for sweep in found] == [16, 2]

@@ -6,14 +6,17 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+from unittest import mock
 
-import h5py
 import numpy as np
 from faults.cases import Outcome, case, file_limit, refused, small_disk, snapshot
-from faults.damaged_files import TREE, _results, _saved, demonstrations, read_demonstrations
+from faults.damaged_files import TREE, _results, _saved
 
-from palm_jax.train import checkpoint, locks, metrics, records
+from palm_jax.envs import make
+from palm_jax.envs.expert import Frames, Recording
+from palm_jax.train import checkpoint, demos, locks, metrics, records
 
 # -- full disk -------------------------------------------------------------------------------------
 
@@ -72,22 +75,57 @@ for _name, _write in _WRITERS:
     case("full disk", f"{_name} meets a full tmpfs", write=_write)(_full_tmpfs)
 
 
+class _Data(NamedTuple):
+    mocap_pos: np.ndarray
+    mocap_quat: np.ndarray
+
+
+class _Start(NamedTuple):
+    camera_to_world: np.ndarray
+    data: _Data
+
+
+class _Expert:
+    """Stands in for the `Demonstrator`: every world is solved, by noise."""
+
+    STEPS = 40
+
+    def __init__(self, runner: Any) -> None:
+        self.runner = runner
+
+    def __call__(self, key: Any, keys: Any, params: Any, *, noise: float) -> Recording:
+        rng, worlds = np.random.default_rng(0), self.runner.worlds
+
+        def some(*shape: int) -> Any:
+            return rng.normal(size=(self.STEPS, worlds, *shape))
+
+        stage, success = np.zeros((2, self.STEPS, worlds), int)
+        frames = Frames(some(16), some(15), some(4, 4), some(), stage, some(10), success)
+        start = _Start(
+            np.tile(np.eye(4), (worlds, 1, 1)),
+            _Data(np.zeros((worlds, 1, 3)), np.zeros((worlds, 1, 4))),
+        )
+        return Recording(frames, start, np.full(worlds, self.STEPS), np.ones(worlds, bool))
+
+
+def _collect(path: Path) -> Path:
+    runner: Any = SimpleNamespace(env=make("lift_lid"), worlds=2)
+    with mock.patch.object(demos, "Demonstrator", _Expert):
+        return demos.collect(runner, path, count=8, seed=0, noise=0.0)
+
+
 @case("full disk", "demonstrations meet a full tmpfs")
 def _full_demos(folder: Path) -> Outcome:
     disk = folder / "disk"
-    with small_disk(disk, size="64k") as remount:
-        try:
-            demonstrations(disk / ".demos.hdf5.1.tmp")
-            with h5py.File(disk / ".demos.hdf5.1.tmp", "r+") as file:
-                file["data/more"] = np.zeros(40_000)
-        except (OSError, RuntimeError) as error:
-            text = " ".join(str(error).split())
-        else:
-            raise AssertionError("the full disk was not noticed")
-        assert "space" in text.lower() or "write failed" in text.lower(), text
-        assert not (disk / "demos.hdf5").exists()  # the name is given at the end only
-        remount("size=4m")
-        assert read_demonstrations(demonstrations(disk / "demos.hdf5")).episodes == 2
+    path = disk / "demos.hdf5"
+    for size in (8, 64, 360):  # from the first byte to the last ones
+        with small_disk(disk, size=f"{size}k") as remount:
+            with refused(OSError, "No space left", str(path)):
+                _collect(path)
+            assert not list(disk.iterdir()), "something is left"
+            remount("size=4m")
+            found = demos.load(_collect(path), task="lift_lid", robot="panda", count=8)
+            assert found.episodes == 8 and len(found.qpos) == 8 * _Expert.STEPS
     return Outcome("an error that names it; no file of that name comes to be", "the collection")
 
 

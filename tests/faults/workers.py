@@ -13,32 +13,17 @@ from typing import Any
 
 import jax
 import numpy as np
+import play
 
-from palm_jax.train import checkpoint, interrupts, learner, records, sweep, table
+from palm_jax.train import __main__ as command
+from palm_jax.train import records, sweep, table
 from palm_jax.train.config import Config
-from palm_jax.train.metrics import MetricsLog
 
 STEPS, EVERY = 100, 3
-CONFIG = learner.LearnerConfig(
-    width=2, crop=20, embed=4, hidden=(8,), batch_size=4, steps=STEPS, warmup_steps=4, ema=0.9
-)
 OPTIONS = sweep.SweepConfig(run=Path(), camera="-30:30:6", workspace="4x5", episodes=1)
 WORLDS = 2  # a batch: 60 of them
 TABLE = table.TableConfig(preset="quick")
 PAUSE = 0.02  # seconds after each piece of work
-
-
-def data() -> learner.Batch:
-    rng = np.random.default_rng(0)
-    return learner.Batch(
-        {"front": rng.integers(0, 256, (30, 24, 24, 3), dtype=np.uint8)},
-        rng.normal(size=(30, 3)).astype(np.float32),
-        rng.normal(size=(30, 10)).astype(np.float32),
-    )
-
-
-def bank() -> np.ndarray:
-    return np.random.default_rng(1).integers(0, 256, (5, 24, 24, 3), dtype=np.uint8)
 
 
 def _quiet(folder: Path) -> None:
@@ -51,46 +36,11 @@ def _quiet(folder: Path) -> None:
 
 
 def train(folder: Path, *, hesitation: float = 0.0) -> None:
-    """A training with real checkpoints; leaves final.npz. Ends with 130 when asked to stop, which
+    """The training command in a run folder, without a simulator. Asked to stop, its last checkpoint
     takes `hesitation` seconds more."""
     _quiet(folder)
-    model, store, stop = learner.make_learner(CONFIG, 3), folder / "checkpoints", interrupts.Stop()
-    with stop.listening():
-        state, done = None, 0
-        found = checkpoint.latest_valid(store)
-        if found:
-            done, path = found
-            state = checkpoint.load(path, model.abstract_state())
-        with MetricsLog(folder / "metrics.jsonl", resume_step=done) as log:
-
-            def on_log(step: int, values: dict[str, float]) -> None:
-                log.write(step, values)
-                _tell(folder, str(step))
-
-            state = learner.run(
-                model,
-                data(),
-                seed=0,
-                state=state,
-                bank=bank(),
-                log_every=1,
-                on_log=on_log,
-                checkpoint_every=EVERY,
-                on_checkpoint=lambda step, state: _save(
-                    store, step, state, pause=hesitation if stop() else 0.0
-                ),
-                should_stop=stop,
-            )
-    if stop():
-        sys.exit(130)
-    leaves = jax.tree_util.tree_leaves_with_path(state)
-    arrays = {jax.tree_util.keystr(name): np.asarray(leaf) for name, leaf in leaves}
-    records.save_arrays(folder / "final.npz", arrays)
-
-
-def _save(store: Path, step: int, state: learner.TrainState, *, pause: float) -> None:
-    time.sleep(pause)
-    checkpoint.save(store, step, state, keep=1)
+    play.set_up(folder, tell=lambda line: _tell(folder, line), hesitation=hesitation)
+    sys.exit(command.main(play.words(folder, steps=STEPS, checkpoint_every=EVERY)))
 
 
 def _tell(folder: Path, line: str) -> None:
@@ -110,6 +60,7 @@ def run_sweep(folder: Path) -> None:
         folder / "sweep.npz",
         runner,
         policy,
+        header={},
         seed=0,
         aligned=True,
         progress=lambda count: _tell(folder, str(count)),

@@ -1,5 +1,7 @@
 """Checkpoints: what is written comes back bit for bit, and what is damaged never does."""
 
+import errno
+import hashlib
 import json
 import logging
 import os
@@ -239,28 +241,168 @@ def test_other_names_are_left_alone(folder: Path) -> None:
     assert (folder / "notes").is_dir() and (folder / "99.old").is_dir()
 
 
-KILLED_BEFORE_THE_RENAME = """
+def _forged(**entries: Any) -> Callable[[Path], None]:
+    """Another manifest with a right checksum; entries that are `None` are left out."""
+
+    def harm(path: Path) -> None:
+        manifest = {**json.loads((path / "manifest.json").read_text()), **entries}
+        kept = {k: v for k, v in manifest.items() if v is not None and k != "checksum"}
+        text = json.dumps(kept, sort_keys=True)
+        kept["checksum"] = hashlib.sha256(text.encode()).hexdigest()
+        (path / "manifest.json").write_text(json.dumps(kept))
+
+    return harm
+
+
+def _deep(path: Path) -> None:
+    (path / "manifest.json").write_text('{"meta": ' + "[" * 100_000 + "]" * 100_000 + "}")
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"),
+    [
+        (_forged(files=None), "files is not"),
+        (_forged(files=["arrays/x"]), "files is not"),
+        (_forged(files={"arrays/x": 3}), "files: arrays/x is not"),
+        (_forged(files={"arrays/x": {"size": "3", "sha256": ""}}), "files: arrays/x is not"),
+        (_forged(step=None), "step is not"),
+        (_forged(step="2"), "step is not"),
+        (_forged(meta=[1]), "meta is not"),
+        (_forged(leaves={"params/bias": {"shape": []}}), "leaves: params/bias is not"),
+        (_deep, "unreadable"),
+    ],
+)
+def test_a_manifest_of_another_kind_is_survived(
+    harm: Callable[[Path], None], said: str, folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whoever made it knew how to make its checksum."""
+    harm(folder / "2")
+    assert checkpoint.best(folder) == [(1, folder / "1")]
+    assert newest(folder) == 1 and set_aside(folder) == ["2-bad-manifest"]
+    assert said in caplog.text
+
+
+def test_a_bad_sector_is_survived(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real, broken = hashlib.file_digest, largest(folder / "2")
+
+    def digest(stream: Any, name: str) -> Any:
+        if Path(stream.name) == broken:
+            raise OSError(errno.EIO, os.strerror(errno.EIO), stream.name)
+        return real(stream, name)
+
+    monkeypatch.setattr(checkpoint.hashlib, "file_digest", digest)
+    assert newest(folder) == 1 and set_aside(folder) == ["2-unreadable"]
+
+
+def test_too_many_open_files_are_nobodys_damage(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def digest(*_: Any) -> Any:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    monkeypatch.setattr(checkpoint.hashlib, "file_digest", digest)
+    with pytest.raises(OSError, match="Too many open files"):
+        newest(folder)
+    assert set_aside(folder) == []
+
+
+@pytest.mark.parametrize("after", range(1, 8))
+def test_a_checkpoint_that_is_removed_while_it_is_read_is_passed_over(
+    after: int, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the training that a reader looks at: after so many looks at files of it."""
+    left, real = after, os.stat
+    doomed = folder / "2"
+
+    def stat(path: Any, *arguments: Any, **options: Any) -> Any:
+        nonlocal left
+        if isinstance(path, (str, Path)) and doomed in (Path(path), *Path(path).parents):
+            left -= 1
+            if left == 0:
+                doomed.rename(folder / ".removing-2-1")
+        return real(path, *arguments, **options)
+
+    for reader in (
+        lambda: checkpoint.best(folder)[0],
+        lambda: checkpoint.latest_valid(folder, repair=False),
+        lambda: checkpoint.latest_valid(folder),
+    ):
+        left = after
+        with monkeypatch.context() as removing:
+            removing.setattr(os, "stat", stat)
+            assert reader() == (1, folder / "1")
+        assert set_aside(folder) == []
+        if (folder / ".removing-2-1").exists():
+            (folder / ".removing-2-1").rename(doomed)
+        else:  # a reader that repairs deletes what was to be deleted
+            assert not doomed.exists()
+
+
+KILLED_BEFORE_A_RENAME = """
 import os, sys
+from pathlib import Path
 import numpy as np
 from palm_jax.train import checkpoint
 
-def die(source, target):
-    os.kill(os.getpid(), 9)
+left, real = int(sys.argv[3]), os.rename
 
-checkpoint.os.rename = die
-checkpoint.save(sys.argv[1], 3, {"x": np.arange(4.0)})
+def rename(source, target):
+    global left
+    left -= Path(source).name.startswith(".saving-") or Path(target).name.startswith(".removing-")
+    if left == 0:
+        os.kill(os.getpid(), 9)
+    real(source, target)
+
+os.rename = rename
+checkpoint.save(sys.argv[1], int(sys.argv[2]), {"x": np.arange(4.0)})
 """
 
 
-def test_killed_between_write_and_rename(folder: Path) -> None:
+@pytest.mark.parametrize(
+    ("step", "renames", "new", "aside"),
+    [
+        (3, 1, True, []),  # whole but for its name
+        (2, 1, False, ["2-unfinished"]),  # the old one has the name
+        (2, 2, True, []),  # nobody has it
+    ],
+)
+def test_killed_between_write_and_rename(
+    step: int, renames: int, new: bool, aside: list[str], folder: Path
+) -> None:
     """The whole process, so that no handler of ours can tidy up."""
     root = Path(__file__).resolve().parents[2]
-    run = subprocess.run([sys.executable, "-c", KILLED_BEFORE_THE_RENAME, folder], cwd=root)
+    words = [str(folder), str(step), str(renames)]
+    run = subprocess.run([sys.executable, "-c", KILLED_BEFORE_A_RENAME, *words], cwd=root)
     assert run.returncode == -9
-    assert len(list(folder.glob(".saving-3-*"))) == 1
-    assert newest(folder) == 2
-    assert set_aside(folder) == ["3-unfinished"]
-    assert not list(folder.glob(".saving-*"))
+    assert len(list(folder.glob(f".saving-{step}-*"))) == 1
+    assert newest(folder) == step
+    assert set_aside(folder) == aside and not list(folder.glob(".*"))
+    names = json.loads((folder / str(step) / "manifest.json").read_text())["leaves"].keys()
+    assert (names == {"x"}) is new
+
+
+def test_half_a_checkpoint_is_set_aside(folder: Path) -> None:
+    _truncate(folder / "2")
+    (folder / "2").rename(folder / f".saving-2-{2**22 + 1}")
+    assert newest(folder) == 1 and set_aside(folder) == ["2-unfinished"]
+
+
+def test_what_has_the_name_keeps_it_if_it_cannot_be_replaced(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.rename
+
+    def rename(source: Path, target: Path) -> None:
+        if ".saving-" in str(source):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        real(source, target)
+
+    monkeypatch.setattr(checkpoint.os, "rename", rename)
+    with pytest.raises(OSError, match="No space"):
+        checkpoint.save(folder, 2, make_tree(5))
+    monkeypatch.undo()
+    assert bits(checkpoint.load(folder / "2", make_tree(0))) == bits(make_tree(2))
+    assert not list(folder.glob(".*"))
 
 
 def test_an_error_while_writing_leaves_nothing(
@@ -365,8 +507,8 @@ def test_a_checkpoint_of_other_options_is_named_and_set_aside(tmp_path: Path) ->
     tree = {"x": np.ones(1)}
     checkpoint.save(tmp_path, 1, tree, {checkpoint.FINGERPRINT: "mine", "score": 0.1})
     checkpoint.save(tmp_path, 2, tree, {checkpoint.FINGERPRINT: "theirs", "score": 0.9})
-    assert checkpoint.best(tmp_path, fingerprint="mine") == [(1, tmp_path / "1")]
-    assert checkpoint.latest_valid(tmp_path, fingerprint="mine") == (1, tmp_path / "1")
+    assert checkpoint.best(tmp_path, fingerprints=["mine"]) == [(1, tmp_path / "1")]
+    assert checkpoint.latest_valid(tmp_path, fingerprints=["mine"]) == (1, tmp_path / "1")
     assert set_aside(tmp_path) == ["2-foreign"]
     checkpoint.save(tmp_path, 3, tree)  # from before there were fingerprints
-    assert checkpoint.latest_valid(tmp_path, fingerprint="mine") == (3, tmp_path / "3")
+    assert checkpoint.latest_valid(tmp_path, fingerprints=["mine"]) == (3, tmp_path / "3")

@@ -1,7 +1,9 @@
 """A training that goes non-finite stops with a dump, which says where it began."""
 
 import dataclasses
+import itertools
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -27,25 +29,31 @@ def model() -> learner.Learner:
     return learner.make_learner(CONFIG, 3)
 
 
-def run(model: learner.Learner, data: learner.Batch, folder: Path) -> Path:
+def run(model: learner.Learner, data: learner.Batch, folder: Path, **options: Any) -> Path:
     """Trains until it stops; the dump that the error names."""
+    options = {"log_every": 4, **options}
     with pytest.raises(learner.NonFiniteError, match="max_skipped_steps = 2") as caught:
         with debug.dumping(folder, model) as on_failure:
-            learner.run(model, data, seed=0, bank=BANK, log_every=4, on_failure=on_failure)
+            learner.run(model, data, seed=0, bank=BANK, on_failure=on_failure, **options)
     path = Path(str(caught.value).rpartition(" ")[2])
     assert "python -m palm_jax debug replay" in str(caught.value) and path.is_dir()
     return path
 
 
+@pytest.mark.parametrize("stopped", [False, True])
 def test_a_bad_sample_is_found_in_its_dump(
-    model: learner.Learner, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    stopped: bool, model: learner.Learner, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its numbers are finite, as `run` asks of its data, but not their squares."""
+    """Its numbers are finite, as `run` asks of its data, but not their squares. Somebody who stops
+    the training before the next line of its log is told as well."""
     actions = DATA.actions.copy()
     actions[:, 6] *= 1e-30
     actions[5, 6] = 3e38
     actions[6, 6] = -3e38  # the range's width overflows
-    path = run(model, dataclasses.replace(DATA, actions=actions), tmp_path)
+    asked = itertools.count()
+    options: dict[str, Any] = {"log_every": 100, "should_stop": lambda: next(asked) == 23}
+    bad = dataclasses.replace(DATA, actions=actions)
+    path = run(model, bad, tmp_path, **(options if stopped else {}))
     again, failure = debug.load(path)
     assert again.config == model.config and failure.batch.proprio.shape == (4, 3)
     assert debug.main(["replay", str(path)]) == 0

@@ -4,36 +4,41 @@ The processes run beside each other, each with devices of its own (virtual ones,
 """
 
 import dataclasses
+import json
 import os
 import shutil
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import h5py
 import jax
 import numpy as np
+import play
 import pytest
 import tiny
+from faults import damaged_files
 from rich.console import Console
 
 from palm_jax.train import __main__ as training
-from palm_jax.train import checkpoint, devices, learner, run
+from palm_jax.train import checkpoint, devices, learner, methods, run, workspace
 from palm_jax.train.devices import DeviceError, Split, Together
 from palm_jax.train.training import Interrupted, Score, Training
 
-SCRIPT = Path(__file__).with_name("devices_process.py")
 ROOT = Path(__file__).resolve().parents[2]
 
-CONFIG = learner.LearnerConfig(
-    width=4, norm="batch", crop=40, embed=8, hidden=(16,), batch_size=8, steps=12,
-    learning_rate=1e-3, warmup_steps=2, ema=0.9,
-)  # fmt: skip
-"""That of devices_process.py, which cannot be imported: it chooses its devices first."""
+# Images large enough for 2 x 2 features at the end: a norm over single numbers would give zeros
+# whose sign is rounding, and the gradient of a ReLU at zero depends on that sign.
+WORDS: dict[str, Any] = {
+    "width": 4, "norm": "batch", "image_size": 44, "random_crop": 40, "batch_size": 8, "steps": 12,
+    "learning_rate": 1e-3, "warmup_steps": 2, "checkpoint_every": 4,
+}  # fmt: skip
 
-PARAMETERS = 2 * CONFIG.learning_rate, 1e-4
+PARAMETERS = 2 * WORDS["learning_rate"], 1e-4
 """Largest difference and root mean square, over all parameters after twelve updates, of one device
 and several (measured: 4.0e-4 and 1.1e-5). The sums of a gradient have another order, so that a ReLU
 near zero may open on one side alone; Adam makes a step of up to the learning rate of that."""
@@ -43,34 +48,26 @@ STATE = 1e-4
 (measured: 7.9e-6): the order of the sums is nearly the same."""
 
 
-def start(folder: Path, *words: object) -> subprocess.Popen[str]:
-    folder.mkdir(exist_ok=True)
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    if cache := jax.config.jax_compilation_cache_dir:
-        environment["JAX_COMPILATION_CACHE_DIR"] = cache
-        environment["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
-    return subprocess.Popen(
-        [sys.executable, str(SCRIPT), str(folder), *map(str, words)],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
+def start(folder: Path, devices: int, *more: object, **options: object) -> subprocess.Popen[str]:
+    """The command with so many devices."""
+    return play.start(folder, *more, options={"devices": devices, **options}, **WORDS)
+
+
+def together(folder: Path, *more: object, second: Mapping[str, Any] | None = None) -> Any:
+    """Two processes of one run with two devices each; `second`: options of the second alone."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    where = [("--distributed", f"127.0.0.1:{port},2,{index}") for index in range(2)]
+    return (
+        start(folder, 2, *where[0]),
+        start(folder, 2, *where[1], *more, **(second or {})),
     )
-
-
-def finish(*processes: subprocess.Popen[str]) -> None:
-    outputs = [process.communicate(timeout=300)[0] for process in processes]
-    assert [process.returncode for process in processes] == [0] * len(processes), outputs
-
-
-def final(folder: Path) -> dict[str, np.ndarray]:
-    with np.load(folder / "final.npz", allow_pickle=False) as file:
-        return dict(file)
 
 
 def differences(one: Path, other: Path, part: str = "") -> np.ndarray:
     """Of every number of the state, or of those whose names begin with `part`."""
-    left, right = final(one), final(other)
+    left, right = play.final(one), play.final(other)
     assert left.keys() == right.keys() and len(left) > 50
     for name in left:
         assert left[name].dtype == right[name].dtype and left[name].shape == right[name].shape
@@ -87,17 +84,27 @@ def assert_near(one: Path, other: Path) -> None:
 @pytest.fixture(scope="module")
 def one(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One process with one device."""
-    folder = tmp_path_factory.mktemp("one")
-    finish(start(folder, 1, 12))
+    folder = tmp_path_factory.mktemp("one") / "run"
+    play.finish(start(folder, 1))
     return folder
 
 
 @pytest.fixture(scope="module")
 def four(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One process with four devices."""
-    folder = tmp_path_factory.mktemp("four")
-    finish(start(folder, 4, 12))
+    folder = tmp_path_factory.mktemp("four") / "run"
+    play.finish(start(folder, 4))
     return folder
+
+
+def begun(one: Path, folder: Path) -> Path:
+    """The run of one device after its first checkpoint, to go on with."""
+    run = shutil.copytree(one, folder / "run")
+    for step in ("8", "12"):
+        shutil.rmtree(run / "checkpoints" / step)
+    for name in ("eval.json", "final.npz"):
+        (run / name).unlink()
+    return run
 
 
 @pytest.mark.slow
@@ -109,21 +116,42 @@ def test_four_devices_give_the_parameters_of_one(one: Path, four: Path) -> None:
 @pytest.mark.slow
 def test_two_processes_train_and_checkpoint_together(one: Path, four: Path, tmp_path: Path) -> None:
     """Two devices each; from a checkpoint that one device wrote, with checkpoints of their own."""
-    shutil.copytree(one / "checkpoints/4", tmp_path / "checkpoints/4")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    finish(*(start(tmp_path, 2, 12, port, 2, index) for index in range(2)))
-    assert_near(one, tmp_path)
-    assert np.abs(differences(four, tmp_path)).max() < STATE
+    run = begun(one, tmp_path)
+    play.finish(*together(run))
+    assert_near(one, run)
+    assert np.abs(differences(four, run)).max() < STATE
     # Whoever reads them needs to know nothing of processes or devices.
-    store = tmp_path / "checkpoints"
-    assert {path.name for path in store.iterdir()} == {"4", "8", "12"}
-    loaded = checkpoint.load(store / "12", learner.make_learner(CONFIG, 3).abstract_state())
+    assert set(play.scores(run)) == {4, 8, 12} and (run / "eval.json").exists()
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows if "loss" in row] == list(range(1, 13))
+    stored = workspace.stored_config(run).learner(methods.find("palm"))
+    loaded = checkpoint.load(run / "checkpoints/12", play.model(stored).abstract_state())
     leaves = jax.tree_util.tree_leaves_with_path(loaded)
-    for name, array in final(tmp_path).items():
+    for name, array in play.final(run).items():
         found = next(leaf for path, leaf in leaves if jax.tree_util.keystr(path) == name)
         np.testing.assert_array_equal(found, array)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["it raises", "it has other demonstrations"])
+def test_a_process_that_fails_ends_the_other(fault: str, one: Path, tmp_path: Path) -> None:
+    """Which says why; and the run goes on afterwards."""
+    run, begin = begun(one, tmp_path), time.monotonic()
+    if fault == "it raises":
+        processes, code, words = together(run, second={"fail_at": 3}), 1, "broken on purpose"
+    else:
+        other = damaged_files.demonstrations(tmp_path / "other.hdf5")
+        with h5py.File(other, "r+") as file:
+            file["data/demo_0/actions"][0, 0] = 7
+            del file["data"].attrs["sha256"]
+        processes, code = together(run, "--data", other), 2
+        words = f"{other}: other demonstrations than those of the first process"
+    outputs = [process.communicate(timeout=120)[0] for process in processes]
+    assert time.monotonic() - begin < 120
+    assert processes[1].returncode == code and words in " ".join(outputs[1].split()), outputs
+    assert processes[0].returncode != 0 and not (run / "eval.json").exists(), outputs
+    play.finish(start(run, 4))
+    assert_near(one, run)
 
 
 def test_a_batch_that_the_devices_do_not_divide_is_refused() -> None:
@@ -220,7 +248,8 @@ def test_who_leaves_scores_no_checkpoint_whoever_was_asked(
     monkeypatch.setattr(devices, "Together", Asked)
     monkeypatch.setattr(learner, "run", stopping)
     config = dataclasses.replace(tiny.config("bc"), steps=4, checkpoint_every=2)
-    job = Training(config, "bc", tiny.learner("bc"), tmp_path, "x", score, augment=False)
+    workspace.begin(dataclasses.replace(config, out=tmp_path), tmp_path, "bc")
+    job = Training(config, "bc", tiny.learner("bc"), tmp_path, score, augment=False)
     nothing = learner.Batch({}, np.zeros((0, 1)), np.zeros((0, 1)))
     with pytest.raises(Interrupted):
         job.train(nothing, Console())

@@ -41,6 +41,20 @@ def test_resume_drops_the_half_line_and_the_steps_to_come(tmp_path: Path) -> Non
     assert path.read_bytes() == whole  # as if never interrupted
 
 
+def test_what_the_log_has_is_not_written_twice(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.jsonl"
+    path.write_text(
+        '{"step": 4, "loss": 2.0}\n{"step": 4, "score": 0.5}\n{"step": 8, "score": 1}\n'
+    )
+    with MetricsLog(path, resume_step=4) as log:
+        for step in (4, 8):
+            log.write_once(step, {"score": 0.5})
+        log.write_once(4, {"other": 0.5})
+    assert [(record["step"], *list(record)[1:]) for record in read_metrics(path)] == [
+        (4, "loss"), (4, "score"), (8, "score"), (4, "other"),
+    ]  # fmt: skip
+
+
 def test_a_complete_last_line_without_newline_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "metrics.jsonl"
     path.write_text('{"step": 1, "loss": 2.0}\n{"step": 2, "loss": 1.0}')

@@ -13,6 +13,7 @@ import h5py
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from palm_jax.align import AlignSpec, Camera
@@ -444,6 +445,19 @@ def test_other_data_are_not_gone_on_with(
     assert main(command) == 2
     error = " ".join(capsys.readouterr().err.split())
     assert f"was begun with {named}" in error and "choose another --out" in error
+
+
+def test_other_pictures_are_not_gone_on_with(
+    calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    Image.new("RGB", (8, 8)).save(folder / "one.png")
+    command = words(calibrated, tmp_path / "run", "--method", "palm", "--backgrounds", str(folder))
+    assert main(command) == 0 and main([*command, "--resume"]) == 0
+    Image.new("RGB", (8, 8), (1, 0, 0)).save(folder / "one.png")
+    assert main([*command, "--resume"]) == 2
+    assert "was begun with backgrounds of SHA-256" in " ".join(capsys.readouterr().err.split())
 
 
 def test_no_room_for_the_images(

@@ -74,7 +74,7 @@ def test_files_from_before_draws_were_counted_still_load(tmp_path: Path) -> None
 def test_strengths_round_trip(tmp_path: Path) -> None:
     success = np.array([[True, False, True], [True, True, True]])
     sweep = records.StrengthSweep("lighting", np.array([-1.0, 0.5]), success, ~success)
-    loaded = records.load_strengths(records.save_strengths(tmp_path / "s.npz", sweep))
+    loaded = records.load_strengths(records.save_sweep(tmp_path / "s.npz", sweep))
     assert loaded.shift == "lighting" and loaded.strengths.tolist() == [-1.0, 0.5]
     np.testing.assert_array_equal(loaded.success, success)
     np.testing.assert_array_equal(loaded.nan, ~success)

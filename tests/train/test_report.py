@@ -100,7 +100,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     records.save_sweep(root / "palm" / "sweep-ur5.npz", sweep)
     some = np.ones((2, 5), bool)
     curve = records.StrengthSweep("object_color", np.array([-1.0, 1.0]), some, ~some)
-    records.save_strengths(root / "bc" / "strength-object_color.npz", curve)
+    records.save_sweep(root / "bc" / "strength-object_color.npz", curve)
     y = np.arange(24, dtype=np.uint8)
     clip = [np.stack([np.add.outer(y, y + i)] * 3, -1).astype(np.uint8) for i in range(4)]
     videos.write_video(root / "videos" / "bc_workspace_viewpoint_2.mp4", clip)
@@ -259,6 +259,21 @@ def test_a_single_run_folder(folder: Path, tmp_path: Path) -> None:
     assert (tmp_path / "o" / "p.html").exists()
     assert read.row("ID") == ["50 % 31–69 paper 52", ""]
     assert "python 'x y.py'" in read.text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_run_of_several_sessions_tells_of_all(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder / "bc", tmp_path / "bc")
+    entries = [
+        {"date": f"2031-02-0{day}", "versions": {"jax": f"9.8.{day}"}, "command": f"train {day}"}
+        for day in (3, 4)
+    ]
+    content = {"sessions": [{**entries[0], "wall_s": 61}, entries[1], {**entries[1], "wall_s": 5}]}
+    (tmp_path / "bc" / "env.json").write_text(json.dumps(content))
+    read = Reader(report.write_report(tmp_path / "bc").read_text())
+    for word in ("2031-02-03", "2031-02-04", "jax 9.8.3", "jax 9.8.4", "train 3", "train 4"):
+        assert word in read.text, word
+    assert "1 min 06 s in all" in read.text
 
 
 def test_missing_parts_are_left_out(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ import tiny
 
 from palm_jax.envs import make
 from palm_jax.envs.base import EnvParams
-from palm_jax.train import locks, records, runs, shards, sweep
+from palm_jax.train import locks, records, runs, shards, sweep, versions
+from palm_jax.train.config import ConfigError
 from palm_jax.train.shards import ShardError
 from palm_jax.train.sweep import SweepConfig
 
@@ -176,7 +177,7 @@ def test_files_are_named_after_robot_and_shift(tmp_path: Path) -> None:
                 shift, np.array([0.0, 1]), np.ones((2, 3), bool), np.zeros((2, 3), bool)
             )
             path = records.sweep_path(tmp_path, robot, shift=shift)
-            assert records.swept_robot(records.save_strengths(path, curve)) == robot
+            assert records.swept_robot(records.save_sweep(path, curve)) == robot
             names.append(path.name)
     assert names == [
         "sweep.npz", "strength-lighting.npz", "strength-object_color+viewpoint.npz",
@@ -186,6 +187,11 @@ def test_files_are_named_after_robot_and_shift(tmp_path: Path) -> None:
     assert not run.problems and set(run.sweeps) == {"", "ur5"}
     both = ("lighting", "object_color+viewpoint")
     assert set(run.strengths) == {(robot, shift) for robot in ("", "ur5") for shift in both}
+
+
+def save(path: Path, arrays: dict[str, Any], header: dict[str, Any]) -> None:
+    """A shard."""
+    records.save_arrays(path, {**arrays, "header": np.asarray(json.dumps(header))})
 
 
 def in_shards(options: SweepConfig, count: int, worlds: int) -> tuple[sweep.Job, list[Any], Any]:
@@ -217,13 +223,13 @@ def test_shards_join_to_the_undivided_sweep(
     asked, parts, whole = in_shards(config, count, config.batch)
     path, header = records.sweep_path(tmp_path, shift=config.shift), {"seed": 0}
     for index, part in enumerate(parts, 1):
-        shards.save(shards.path_of(path, index, count), vars(part), header)
+        save(shards.path_of(path, index, count), vars(part), header)
     arrays = shards.merge(path, asked.shape, asked.part, asked.grid, header)
     assert whole.success.any() or whole.success.size == 1
     for name in ("success", "nan"):
         np.testing.assert_array_equal(arrays[name], getattr(whole, name))
     assert arrays["worlds"] == config.batch
-    asked.save(path, asked.record(**asked.grid, **arrays))
+    records.save_sweep(path, asked.record(**asked.grid, **arrays), header)
     assert not runs.load_run(tmp_path).problems and runs.find_runs(tmp_path) == []
 
 
@@ -238,25 +244,25 @@ def test_shards_of_two_kinds_are_not_joined(tmp_path: Path) -> None:
     with pytest.raises(ShardError, match="expected the shards of one sweep.*found none"):
         joined()
     for index in (1, 3):
-        shards.save(shards.path_of(path, index, 3), vars(parts[index - 1]), header)
+        save(shards.path_of(path, index, 3), vars(parts[index - 1]), header)
     with pytest.raises(ShardError, match="the shards 2/3 are missing.*--shard 2/3"):
         joined()
     second = shards.path_of(path, 2, 3)
-    shards.save(second, vars(parts[1]), {**header, "policy": "cd"})
+    save(second, vars(parts[1]), {**header, "policy": "cd"})
     with pytest.raises(ShardError, match="2-of-3.npz was made with policy = 'cd', here it is 'ab'"):
         joined()
-    shards.save(second, {**vars(parts[1]), "xs": parts[1].xs + 0.1}, header)
+    save(second, {**vars(parts[1]), "xs": parts[1].xs + 0.1}, header)
     with pytest.raises(ShardError, match="2-of-3.npz: its xs are not those of this command"):
         joined()
-    shards.save(second, {**vars(parts[1]), "nan": parts[1].nan[:1]}, header)
+    save(second, {**vars(parts[1]), "nan": parts[1].nan[:1]}, header)
     with pytest.raises(ShardError, match=r"nan: expected shape \(3, 2, 2, 1\), got \(1, 2, 2, 1\)"):
         joined()
     records.save_sweep(second, parts[1])
     with pytest.raises(ShardError, match="not a shard of a sweep"):
         joined()
-    shards.save(second, vars(parts[1]), header)
+    save(second, vars(parts[1]), header)
     assert joined()["success"].shape == (3, 2, 2, 1)
-    shards.save(shards.path_of(path, 1, 2), vars(parts[0]), header)
+    save(shards.path_of(path, 1, 2), vars(parts[0]), header)
     with pytest.raises(ShardError, match="found 2 parts and 3 parts"):
         joined()
 
@@ -302,7 +308,7 @@ class Killed(Exception):
 
 @pytest.mark.parametrize("kind", ["grid", "strength"])
 def test_a_sweep_goes_on_from_its_last_batch_and_not_from_anothers(
-    kind: str, tmp_path: Path
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if kind == "grid":
         options = SweepConfig(run=Path(), camera="-10:10:2", workspace="3x4", episodes=2)
@@ -310,7 +316,9 @@ def test_a_sweep_goes_on_from_its_last_batch_and_not_from_anothers(
         options = SweepConfig(run=Path(), shift="viewpoint", strength="0:1:3", episodes=16)
     job, total = sweep.job(options), 48
 
-    def perform(name: str, *, seed: int = 0, left: int = total) -> tuple[int, bytes]:
+    def perform(
+        name: str, *, seed: int = 0, left: int = total, other_versions: bool = False
+    ) -> tuple[int, bytes]:
         """Runs until `left` episodes have been told; the batches it took, and the file."""
         runner, made = rooms.evaluator(5)
 
@@ -323,7 +331,16 @@ def test_a_sweep_goes_on_from_its_last_batch_and_not_from_anothers(
         path = tmp_path / name
         path.unlink(missing_ok=True)
         try:
-            job.perform(path, runner, POLICY, seed=seed, aligned=True, progress=progress)
+            job.perform(
+                path,
+                runner,
+                POLICY,
+                header={},
+                seed=seed,
+                aligned=True,
+                progress=progress,
+                other_versions=other_versions,
+            )
         except Killed:
             assert not path.exists()
             return len(made["panda"].keys), b""
@@ -336,6 +353,21 @@ def test_a_sweep_goes_on_from_its_last_batch_and_not_from_anothers(
     assert content == expected and finished <= whole - begun + 1
     perform("sweep.npz", left=20)  # what another question found is not taken over
     assert perform("sweep.npz", seed=1)[0] == whole
+    perform("sweep.npz", left=20)  # under other versions only when told
+    with monkeypatch.context() as other:
+        real = versions.current()
+        other.setattr(versions, "current", lambda: {**real, "jax": "0.0.1"})
+        with pytest.raises(ConfigError, match=rf"partial was begun with jax {real['jax']}, now it"):
+            perform("sweep.npz")
+        finished, content = perform("sweep.npz", other_versions=True)
+    assert content == expected and finished <= whole - begun + 1
+    perform("sweep.npz", left=20)  # versions were not always noted
+    kept = tmp_path / ".sweep.npz.partial"
+    with np.load(kept) as file:
+        arrays = {name: file[name] for name in file.files if name != "header"}
+    kept.write_bytes(records.save_arrays(tmp_path / "old.npz", arrays).read_bytes())
+    finished, content = perform("sweep.npz")
+    assert content == expected and finished <= whole - begun + 1
     perform("sweep.npz", left=20)
     (tmp_path / ".sweep.npz.partial").write_bytes(b"PK damaged")
     assert perform("sweep.npz") == (whole, expected)

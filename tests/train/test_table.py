@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 import time
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ SMALL = TableConfig(
     preset="quick", tasks=("lift_lid", "lift_spam"), methods=("arro", "bc", "palm"), seeds=(0, 1)
 )
 
+TIMES = {"training_and_selection_s": 30.0, "selection_s": 6.0, "evaluation_s": 10.0}
+
 
 class Trainer:
     """Stands in for the training process."""
@@ -28,6 +31,9 @@ class Trainer:
         self.asked: list[str] = []
         self.failing: set[str] = set()
         self.stop_at: str | None = None
+        self.times = json.dumps(TIMES)
+        self.env: object = {}
+        self.demonstrations: dict[str, str] = {}  # SHA-256 by task
         monkeypatch.setattr(table, "_train", self)
 
     def __call__(self, config: Config, log: Path) -> int:
@@ -46,8 +52,11 @@ class Trainer:
             "object_xy": np.zeros((24, 2)), "camera_angle": np.zeros(24), "length": np.ones(24),
         }  # fmt: skip
         records.save_eval(config.out / "eval.npz", {"in_domain": episodes})
-        took = {"training_and_selection_s": 30.0, "selection_s": 6.0, "evaluation_s": 10.0}
-        (config.out / "times.json").write_text(json.dumps(took))
+        (config.out / "times.json").write_text(self.times)
+        (config.out / "env.json").write_text(json.dumps(self.env))
+        if config.task in self.demonstrations:
+            digests = {"demonstrations": self.demonstrations[config.task]}
+            (config.out / "config.json").write_text(json.dumps({"digests": digests}))
         return 0
 
 
@@ -81,6 +90,11 @@ def test_shards_divide_the_cells() -> None:
         for i in range(1, 6)
     ]
     assert sum(map(len, parts)) == 12 and len(set().union(*parts)) == 12
+
+
+def test_a_shard_that_is_none_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(dataclasses.replace(SMALL, out=tmp_path, shard="3/2")) == 2
+    assert "shard: expected i/n with i from 1 to n, got '3/2'" in capsys.readouterr().err
 
 
 def test_a_cell_is_a_training_command(tmp_path: Path) -> None:
@@ -176,6 +190,84 @@ def test_shards_are_merged(tmp_path: Path, trainer: Trainer) -> None:
         assert episodes[f"{task}/{method}/0/in_domain"].success.sum() == counted
 
 
+def test_what_cannot_be_merged_is_named_and_changes_nothing(
+    tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = (
+        dataclasses.replace(SMALL, out=tmp_path / name, seeds=(0,), methods=(name,))
+        for name in ("palm", "bc")
+    )
+    assert run(first) == run(second) == 0
+    beside = table_page.episodes_file(second.file)
+    whole = beside.read_bytes()
+    before = first.file.read_bytes(), table_page.episodes_file(first.file).read_bytes()
+
+    def refused(*paths: Path) -> str:
+        assert run(dataclasses.replace(first, merge=paths)) == 2
+        after = first.file.read_bytes(), table_page.episodes_file(first.file).read_bytes()
+        assert after == before
+        return " ".join(capsys.readouterr().err.split())
+
+    wrong = tmp_path / "wrong" / "table.json"
+    assert f"expected the JSON file of a shard, got {wrong}" in refused(second.file, wrong)
+    with np.load(beside) as file:
+        arrays = dict(file)
+    some = {name: array for name, array in arrays.items() if not name.startswith("lift_spam")}
+    np.savez(beside, **some)
+    error = refused(second.file)
+    assert f"{second.file}: lift_spam/bc-s0: in_domain" in error and "count None" in error
+    name = "lift_spam/bc/0/in_domain/success"
+    np.savez(beside, **arrays | {name: ~arrays[name]})
+    assert "lift_spam/bc-s0: in_domain: {'successes': 4" in refused(second.file)
+    beside.unlink()
+    assert f"{second.file}: lift_lid/bc-s0" in refused(second.file)
+    beside.write_bytes(whole)
+    assert run(dataclasses.replace(first, merge=(second.file,))) == 0
+    assert len(records.load_eval(table_page.episodes_file(first.file))) == 4
+
+
+def test_cells_of_other_demonstrations_are_not_mixed(
+    tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither in a file, nor when files are merged."""
+    config = dataclasses.replace(SMALL, out=tmp_path / "one", seeds=(0,), methods=("palm",))
+    assert run(config) == 0  # by a version that did not note them
+    assert json.loads(config.file.read_text())["header"]["demonstrations"] == {}
+    trainer.demonstrations = {"lift_lid": "a" * 64, "lift_spam": "b" * 64}
+    assert run(dataclasses.replace(config, methods=("bc",))) == 0
+    header = json.loads(config.file.read_text())["header"]
+    assert header["demonstrations"] == trainer.demonstrations
+    before = config.file.read_bytes(), table_page.episodes_file(config.file).read_bytes()
+    trainer.demonstrations["lift_spam"] = "c" * 64
+    assert run(dataclasses.replace(config, tasks=("lift_spam",), methods=("arro",))) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "demonstrations of lift_spam with SHA-256 cccccccccccc" in error
+    assert "begun with bbbbbbbbbbbb" in error
+    other = dataclasses.replace(config, out=tmp_path / "two", methods=("arro",))
+    assert run(other) == 0
+    assert run(dataclasses.replace(config, merge=(other.file,))) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert f"{other.file}: demonstrations of lift_spam with SHA-256 cccccccccccc" in error
+    after = config.file.read_bytes(), table_page.episodes_file(config.file).read_bytes()
+    assert after == before
+
+
+@pytest.mark.parametrize("kind", ["one of the sessions", "the only one"])
+def test_a_cell_of_other_versions_is_not_entered(
+    kind: str, tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was made before an upgrade, and taken from its folder after it."""
+    config = dataclasses.replace(SMALL, out=tmp_path, seeds=(0,), methods=("palm",))
+    here = metadata.version("jax")
+    old, now = {"versions": {"jax": "0.0.1"}}, {"versions": {"jax": here}}
+    trainer.env = {"sessions": [old, now]} if kind == "one of the sessions" else old
+    assert run(config) == 2 and not config.file.exists()
+    error = " ".join(capsys.readouterr().err.split())
+    assert f"lift_lid/palm-s0 was made with jax 0.0.1, the table with {here}" in error
+    trainer.env = {"sessions": [now, now]}
+    assert run(config) == 0
+
+
 def test_the_header_tells_the_speed(tmp_path: Path, trainer: Trainer) -> None:
     config = dataclasses.replace(SMALL, out=tmp_path, seeds=(0,), methods=("palm",))
     assert run(config) == 0
@@ -185,12 +277,37 @@ def test_the_header_tells_the_speed(tmp_path: Path, trainer: Trainer) -> None:
 
 
 @pytest.mark.parametrize(
+    "left",
+    [
+        '{"training_and_selection_s": 30.0, "selection_s": 6.0}',  # killed before the last number
+        '{"training_and_selection_s": 30.0, "evaluation_s": null}',
+        '{"training_and_selection_s": "30", "evaluation_s": 10.0}',
+        "{",
+    ],
+)
+def test_a_cell_whose_times_are_not_known_is_entered(
+    left: str, tmp_path: Path, trainer: Trainer
+) -> None:
+    """Its results are whole: no further command would ever write the times."""
+    config = dataclasses.replace(SMALL, out=tmp_path, seeds=(0,), methods=("palm",))
+    trainer.times = left
+    assert run(config) == 0
+    stored = json.loads(config.file.read_text())
+    assert set(stored["results"]) == {"lift_lid", "lift_spam"} and not stored.get("times")
+    assert "samples_per_second" not in stored["header"]
+    # The next cells' times count alone.
+    trainer.times = json.dumps(TIMES)
+    assert run(dataclasses.replace(config, methods=("bc",))) == 0
+    header = json.loads(config.file.read_text())["header"]
+    assert header["samples_per_second"] == 2400 * 32 / 24.0
+
+
+@pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"tasks": ("lid",)}, "unknown task 'lid'; known: lift_lid"),
         ({"methods": ("plam",)}, "unknown method 'plam'; known: palm"),
         ({"preset": "huge"}, "unknown preset 'huge'; known: quick"),
-        ({"shard": "3/2"}, "shard: expected i/n with i from 1 to n, got '3/2'"),
         ({"seeds": (1, 1)}, "seeds: expected one or more, each once"),
     ],
 )
