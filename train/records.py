@@ -218,7 +218,7 @@ def header_of(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     """The header among arrays; empty if there is none."""
     try:
         header = json.loads(str(arrays[HEADER]))
-    except (KeyError, ValueError):
+    except (KeyError, ValueError, RecursionError):
         return {}
     return header if isinstance(header, dict) else {}
 

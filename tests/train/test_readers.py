@@ -201,12 +201,12 @@ def test_sweeps_are_whole_or_refused(data: st.DataObject, tmp_path: Path) -> Non
 def test_shards_are_whole_or_refused(data: st.DataObject, tmp_path: Path) -> None:
     grid = {"angles": np.zeros(2), "xs": np.zeros(2), "ys": np.zeros(2)}
     good = {name: np.zeros((2, 2, 2, 2), bool) for name in ("success", "nan")}
-    good |= {**grid, "worlds": np.array(4), shards.HEADER: np.array('{"seed": 0}')}
+    good |= {**grid, "worlds": np.array(4), records.HEADER: np.array('{"seed": 0}')}
     path = shards.path_of(tmp_path / "sweep.npz", 1, 1)
     path.parent.mkdir(exist_ok=True)
     found = arrays_of(data, good)
     if data.draw(st.booleans()):
-        found[shards.HEADER] = np.array(data.draw(changed({"seed": 0})).replace("\0", ""))
+        found[records.HEADER] = np.array(data.draw(changed({"seed": 0})).replace("\0", ""))
     written(path, found)
     try:
         joined = shards.merge(

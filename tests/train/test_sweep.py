@@ -290,6 +290,7 @@ def test_what_is_left_to_another_process_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, swept = tiny.write(tmp_path / "run"), []
+    (folder / "eval.json").write_text("{}")
     monkeypatch.setattr(sweep.Runners, "of", lambda *_, **__: None)
     monkeypatch.setattr(sweep, "_sweep_one", lambda folder, *_: swept.append(folder))
     claim = {"host": "elsewhere", "processes": [{"pid": 1, "started": ""}], "since": "noon"}
