@@ -106,8 +106,9 @@ class Training:
                     "task": config.task,
                     checkpoint.FINGERPRINT: fingerprint,
                 }
-                log.sync()  # a checkpoint on the disk has its log there
-                path = checkpoint.save(store, step, state, meta, keep=config.keep)
+                with timed(self.folder, "checkpoints_s"):
+                    log.sync()  # a checkpoint on the disk has its log there
+                    path = checkpoint.save(store, step, state, meta, keep=config.keep)
                 if not together.agreed:
                     self._score_if_missing(path, step, state, log)
                 devices.wait()
