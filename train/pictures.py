@@ -6,7 +6,8 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".webp"}
-_FORMATS = ("PNG", "JPEG", "BMP", "WEBP")
+FORMATS = ("PNG", "JPEG", "BMP", "WEBP")
+"""Named to Pillow, which starts Ghostscript for a file that is PostScript inside."""
 
 
 def read_folder(folder: Path, size: int, *, most: int = 512) -> np.ndarray:
@@ -21,8 +22,7 @@ def read_folder(folder: Path, size: int, *, most: int = 512) -> np.ndarray:
     pictures = []
     for file in files:
         try:
-            # Named, because Pillow starts Ghostscript for a file that is PostScript inside.
-            with Image.open(file, formats=_FORMATS) as picture:
+            with Image.open(file, formats=FORMATS) as picture:
                 pictures.append(np.asarray(picture.convert("RGB").resize((size, size))))
         except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
             raise ValueError(f"{file} cannot be read as a picture: {error}") from error

@@ -30,7 +30,7 @@ from rich.table import Table
 from palm_jax._checks import OptionError
 from palm_jax.align import AlignSpec
 from palm_jax.train import console as terminal
-from palm_jax.train import interrupts
+from palm_jax.train import interrupts, records
 from palm_jax.train.data import aligning, check, importers, inspection, job, soundness
 from palm_jax.train.data import calibration as calib
 from palm_jax.train.data.calibration import Calibration, CameraCalibration, RobotKeys
@@ -337,7 +337,8 @@ class Check:
 def run_check(config: Check, console: Console) -> int:
     with open_recording(config.file, config.calibration, camera=config.camera) as recording:
         report = check.check(recording, least=config.least_in_view, pixels=config.pixels)
-        out = config.out or Path(f"{config.file.stem}-{recording.camera.name}.png")
+        name = records.file_word(recording.camera.name)
+        out = config.out or Path(f"{config.file.stem}-{name}.png")
         spec = aligning.paper_spec(recording.camera.height)
         with disk_full(out, "the sheet was not written"):
             check.sheet(recording, report, spec, out)

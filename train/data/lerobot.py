@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from PIL import Image
 from palm_jax.train.data import video
 from palm_jax.train.data.errors import FormatError, KeyMissingError, TruncatedError
 from palm_jax.train.data.source import Feature, Source
+from palm_jax.train.pictures import FORMATS
 
 CODEBASE = "v3.0"
 
@@ -25,7 +27,8 @@ class LeRobotSource(Source):
     """A LeRobot v3 folder. See `Source`; episodes are named "0", "1", ... as they are numbered.
 
     Raises:
-      FormatError: another version, or a table or field that is missing.
+      FormatError: another version, a table or field that is missing, or a name that leads out of
+        the folder (names of videos and pictures: where they are used).
       ExtraMissingError: without pyarrow.
     """
 
@@ -33,6 +36,7 @@ class LeRobotSource(Source):
 
     def __init__(self, path: Path):
         self.path = path
+        self._root = path.resolve()
         self._pq = video.extra("pyarrow.parquet")
         self.info = self._json("meta/info.json")
         version = str(self.info.get("codebase_version"))
@@ -44,12 +48,46 @@ class LeRobotSource(Source):
         self.fps = float(self.info["fps"])
         self._rows = self._episode_rows()
         self.episodes = tuple(self._rows)
+        for key in self.info["features"]:
+            _check_name(path, key)
         self._features = {key: _feature(key, entry) for key, entry in self.info["features"].items()}
         self._tasks = self._task_names()
 
+    def _inside(self, name: str | Path) -> Path:
+        """A file of the data set, by the name that the data set itself gives it.
+
+        Raises:
+          FormatError: it lies elsewhere.
+        """
+        path = self.path / name
+        try:
+            inside = path.resolve().is_relative_to(self._root)
+        except (OSError, RuntimeError, ValueError):  # links in a circle, names that are none
+            inside = False
+        if not inside:
+            raise FormatError(
+                f"{path} leads out of the data set; expected files that lie in {self.path}: if you "
+                "trust it, copy what it refers to into it (`cp -rL` for links)"
+            )
+        return path
+
+    def _named(self, field: str, **places: Any) -> Path:
+        """The file that a pattern of meta/info.json names."""
+        try:
+            name = self.info[field].format(**places)
+        except (LookupError, ValueError, AttributeError, TypeError) as error:
+            raise FormatError(
+                f"{self.path / 'meta/info.json'}: {field}: expected a pattern of "
+                f"{', '.join(places)}, got {self.info.get(field)!r} ({error})"
+            ) from error
+        return self._inside(name)
+
+    def files(self) -> list[Path]:
+        return [self._inside(path.relative_to(self.path)) for path in super().files()]
+
     def _json(self, name: str) -> dict[str, Any]:
         try:
-            content: dict[str, Any] = json.loads((self.path / name).read_text())
+            content: dict[str, Any] = json.loads(self._inside(name).read_text())
         except (OSError, ValueError) as error:
             raise FormatError(f"{self.path / name}: not readable ({error})") from error
         return content
@@ -76,13 +114,14 @@ class LeRobotSource(Source):
             raise FormatError(f"{self.path}: no table in meta/episodes")
         rows = []
         for file in files:
+            file = self._inside(file.relative_to(self.path))
             wanted = [name for name in self._names(file) if not name.startswith("stats/")]
             rows += self._table(file, wanted).to_pylist()
         rows.sort(key=lambda row: row["episode_index"])
         return {str(row["episode_index"]): row for row in rows}
 
     def _task_names(self) -> dict[int, str]:
-        file = self.path / "meta" / "tasks.parquet"
+        file = self._inside("meta/tasks.parquet")
         if not file.is_file():
             return {}
         table = self._table(file).to_pydict()
@@ -92,7 +131,7 @@ class LeRobotSource(Source):
     @property
     def stats(self) -> dict[str, Any]:
         """meta/stats.json, or nothing."""
-        file = self.path / "meta" / "stats.json"
+        file = self._inside("meta/stats.json")
         return self._json("meta/stats.json") if file.is_file() else {}
 
     def row(self, episode: str) -> dict[str, Any]:
@@ -107,10 +146,9 @@ class LeRobotSource(Source):
 
     def _data_file(self, episode: str) -> Path:
         row = self._rows[episode]
-        name = self.info["data_path"].format(
-            chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
+        return self._named(
+            "data_path", chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
         )
-        return self.path / name
 
     def column(self, episode: str, key: str) -> Any:
         """A column of the episode's table, as pyarrow has it."""
@@ -150,23 +188,23 @@ class LeRobotSource(Source):
     def video(self, episode: str, key: str) -> tuple[Path, float]:
         """The video file of an episode, and where in it the episode begins (seconds)."""
         row = self._rows[episode]
-        name = self.info["video_path"].format(
+        file = self._named(
+            "video_path",
             video_key=key,
             chunk_index=row[f"videos/{key}/chunk_index"],
             file_index=row[f"videos/{key}/file_index"],
         )
-        file = self.path / name
         if not file.is_file():
             raise TruncatedError(f"{file}: missing; copy the data set again")
         return file, float(row[f"videos/{key}/from_timestamp"])
 
     def _decoded(self, item: dict[str, Any]) -> np.ndarray:
         content = item.get("bytes")
-        source: Any = io.BytesIO(content) if content else self.path / str(item.get("path"))
+        source: Any = io.BytesIO(content) if content else self._inside(str(item.get("path")))
         try:
-            with Image.open(source) as picture:
+            with Image.open(source, formats=FORMATS) as picture:
                 return np.asarray(picture.convert("RGB"))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, Image.DecompressionBombError) as error:
             raise TruncatedError(f"{self.path}: an image that cannot be read ({error})") from error
 
     def image(self, episode: str, key: str, index: int) -> np.ndarray:
@@ -182,6 +220,15 @@ class LeRobotSource(Source):
 
     def close(self) -> None:
         pass
+
+
+def _check_name(path: Path, key: str) -> None:
+    """Names become parts of paths: those of the data set, and those of what is written from it."""
+    if re.fullmatch(r"[^/\\\x00-\x1f]+", key) is None or not key.strip("."):
+        raise FormatError(
+            f"{path / 'meta/info.json'}: feature {key!r}: expected a name without / and \\, and "
+            "not of dots alone"
+        )
 
 
 def _feature(key: str, entry: dict[str, Any]) -> Feature:

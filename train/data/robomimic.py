@@ -20,6 +20,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from palm_jax.train import hdf5_files
 from palm_jax.train.data.errors import FormatError, KeyMissingError, TruncatedError
 from palm_jax.train.data.source import Feature, Source
 
@@ -76,11 +77,25 @@ def is_image(dataset: h5py.Dataset) -> bool:
     return bool(len(shape) == 4 and shape[-1] == 3 and dtype == np.uint8 and min(shape[1:3]) > 4)
 
 
-class RobomimicSource(Source):
-    """A robomimic file. See `Source`.
+def refuse(path: Path, wrong: str | None) -> None:
+    """Raises what `hdf5_files` has found.
 
     Raises:
-      TruncatedError, FormatError: see `open_hdf5`; no `data` group, or no episode in it.
+      FormatError: with what to do.
+    """
+    if wrong:
+        raise FormatError(
+            f"{path}: {wrong}; a file may have been merged of others in this way: write one that "
+            "holds all itself, with h5py's Group.copy(..., expand_soft=True, expand_external=True)"
+        )
+
+
+class RobomimicSource(Source):
+    """A robomimic file. See `Source`. Nothing is read from other files that this one refers to.
+
+    Raises:
+      TruncatedError, FormatError: see `open_hdf5`; no `data` group, or no episode in it; an episode
+        that lies in another file (where it is used).
     """
 
     format = "robomimic"
@@ -96,6 +111,8 @@ class RobomimicSource(Source):
             raise
 
     def _read_header(self) -> None:
+        for name in ("data", "mask"):
+            refuse(self.path, hdf5_files.link(self.file, name))
         data = self.file.get("data")
         if not isinstance(data, h5py.Group):
             raise FormatError(
@@ -103,6 +120,8 @@ class RobomimicSource(Source):
                 f"{', '.join(self.file) or 'nothing'})"
             )
         self.data = data
+        self._looked_at: set[str] = set()
+        self._look_at_masks()
         names = [name for name in data if self._is_episode(name)]
         if not names:
             raise FormatError(f"{self.path}: no episode in 'data'")
@@ -112,8 +131,17 @@ class RobomimicSource(Source):
         self.fps = float(kwargs.get("control_freq") or data.attrs.get("fps", DEFAULT_FPS))
         self._features = {key: _feature(dataset) for key, dataset in self.datasets(names[0])}
 
+    def _look_at_masks(self) -> None:
+        try:
+            if isinstance(masks := self.file.get("mask"), h5py.Group):
+                refuse(self.path, hdf5_files.way_out(masks))
+        except (OSError, RuntimeError, KeyError):
+            pass  # damaged: an error where they are used
+
     def _is_episode(self, name: str) -> bool:
         try:
+            if hdf5_files.link(self.data, name):
+                return True
             return isinstance(self.data[name], h5py.Group)
         except (OSError, RuntimeError, KeyError):
             return True  # one that cannot be read is an error where it is used
@@ -123,8 +151,13 @@ class RobomimicSource(Source):
 
         Raises:
           TruncatedError: it cannot be read.
+          FormatError: it leads to another file.
         """
         try:
+            if episode not in self._looked_at:
+                refuse(self.path, hdf5_files.link(self.data, episode))
+                refuse(self.path, hdf5_files.way_out(self.data[episode]))
+                self._looked_at.add(episode)
             return self.data[episode]
         except (OSError, RuntimeError, KeyError) as error:
             raise TruncatedError(
@@ -199,8 +232,6 @@ class RobomimicSource(Source):
             dataset.chunks is None
             and dataset.dtype == np.uint8
             and dataset.id.get_offset() is not None
-            and not dataset.external
-            and not dataset.is_virtual
             and self.file.userblock_size == 0
             and self.file.driver == "sec2"
         )

@@ -150,7 +150,7 @@ class RobomimicWriter(output.Writer):
 
     def _keep(self, demo: h5py.Group, name: str) -> None:
         if isinstance(self.source, RobomimicSource):
-            old = self.source.data[name]
+            old = self.source.demo(name)
             for key, value in old.attrs.items():
                 if not key.startswith("palm_"):
                     demo.attrs[key] = value
