@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from palm_jax.align import AlignSpec
 from palm_jax.train import data
 from palm_jax.train.data import aligning, job, output, robomimic_writer, soundness
-from palm_jax.train.data.errors import DataError, OutputError, TruncatedError
+from palm_jax.train.data.errors import DataError, EpisodeLengthError, OutputError, TruncatedError
 from palm_jax.train.data.job import Options
 from palm_jax.train.data.recording import Recording, open_recording
 
@@ -185,6 +185,39 @@ def test_a_camera_that_moved_between_episodes(tmp_path: Path) -> None:
         found = {e.name: e for e in data.aligned_episodes(recording, SPEC)}
     heights = [e.camera.cam_to_world[2, 3] for e in found.values()]
     assert heights[1] - heights[0] == pytest.approx(0.1, abs=1e-6)
+
+
+def test_one_of_many_episodes_has_no_images(tmp_path: Path) -> None:
+    """It is neither skipped nor are the others written without it."""
+
+    def empty(file: h5py.File) -> None:
+        for number in range(2, 12):
+            file.copy(f"data/demo_{number % 2}", f"data/demo_{number}")
+        demo = file["data/demo_2"]
+        datasets.replace(demo, datasets.IMAGES, demo[datasets.IMAGES][:0])
+
+    (tmp_path / "source").mkdir(), (tmp_path / "out").mkdir()
+    path = datasets.changed(datasets.LIFT, tmp_path / "source", empty)
+    for trust in (False, True):
+        with open_recording(path, datasets.robosuite()) as recording:
+            with pytest.raises(EpisodeLengthError, match="demo_2 has 15 poses and 0 images"):
+                data.align_file(recording, SPEC, tmp_path / "out" / "new", trust=trust)
+        assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_more_images_than_poses_where_a_block_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def add(file: h5py.File) -> None:
+        demo = file["data/demo_0"]
+        images = np.repeat(demo[datasets.IMAGES], 2, 0)[:20]
+        datasets.replace(demo, datasets.IMAGES, images)
+
+    monkeypatch.setattr(aligning, "BLOCK", 5)
+    path = datasets.changed(datasets.LIFT, tmp_path, add)
+    with open_recording(path, datasets.robosuite()) as recording:
+        with pytest.raises(EpisodeLengthError, match="15 poses and more images"):
+            list(data.aligned_episodes(recording, SPEC))
 
 
 def test_the_paper_scales_with_the_frame() -> None:

@@ -263,6 +263,14 @@ CASES: dict[str, Case] = {
         "EpisodeLengthError", ["31 poses and more images"],
         change=images(lambda i: np.concatenate([i, i[:3]])),
     ),
+    "no images in an episode": Case(
+        "EpisodeLengthError", ["31 poses and 0 images", "data repair"],
+        change=rows(datasets.IMAGES, 0),
+    ),
+    "no images in an episode, not looked at before": Case(
+        "EpisodeLengthError", ["31 poses and 0 images", "data repair"],
+        change=rows(datasets.IMAGES, 0), options=("--trust",),
+    ),
     # Options.
     "a crop larger than the frame": Case(
         "DataError", ["--crop", "128 x 128", "got 300"], options=("--crop", "300")

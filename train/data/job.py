@@ -69,7 +69,7 @@ class Result:
     """Of `align_file`."""
 
     path: Path
-    episodes: int
+    episodes: int  # that are in the new file
     frames: int
     resumed: int  # episodes that an earlier call had finished
     in_view: float  # share of frames with the TCP in the image
@@ -159,7 +159,8 @@ def align_file(
     with writing(out):
         writer = _writer(recording, spec, out, options)
         try:
-            _write(recording, spec, writer, options, progress or (lambda frames: None))
+            written = _write(recording, spec, writer, options, progress or (lambda frames: None))
+            assert list(written) == list(recording.source.episodes), "episodes are missing"
             writer.complete()
         except KeyboardInterrupt:
             writer.stop()
@@ -167,7 +168,8 @@ def align_file(
         except BaseException:
             writer.discard()
             raise
-    return Result(out, survey.episodes, survey.frames, len(writer.done), survey.in_view)
+    frames = sum(written.values())
+    return Result(out, len(written), frames, len(writer.done), survey.in_view)
 
 
 def _check_spec(recording: Recording, spec: AlignSpec, options: Options) -> None:
@@ -200,10 +202,11 @@ def _write(
     writer: Writer,
     options: Options,
     progress: Callable[[int], None],
-) -> None:
-    finished = set(writer.done)
-    left = [name for name in recording.source.episodes if name not in finished]
-    progress(sum(recording.source.length(name) for name in finished))
+) -> dict[str, int]:
+    """Returns the frames of each episode that is in the output now."""
+    written = {name: recording.source.length(name) for name in writer.done}
+    left = [name for name in recording.source.episodes if name not in written]
+    progress(sum(written.values()))
     episodes = aligning.stream(recording, spec, episodes=left, transitions=options.transitions)
     try:
         for name, trajectory, actions, blocks in episodes:
@@ -213,11 +216,14 @@ def _write(
                 "opening": trajectory.opening.astype(np.float32),
             }
             writer.begin(name, len(actions), known)
+            written[name] = 0
             for image, proprio, valid in (
                 (np.asarray(b.image), np.asarray(b.proprio), np.asarray(b.valid)) for b in blocks
             ):
                 writer.add(image, {"proprio": proprio, "valid": valid})
                 progress(len(image))
+                written[name] += len(image)
             writer.end()
     finally:
         episodes.close()  # type: ignore[attr-defined]
+    return written
