@@ -24,6 +24,7 @@ import h5py
 import numpy as np
 
 from palm_jax.train import data
+from palm_jax.train.data import output
 from palm_jax.train.data.lerobot_writer import LeRobotWriter
 from palm_jax.train.data.source import Source
 
@@ -131,15 +132,17 @@ def record(path: Path, layout: str) -> None:
 def _as_video(path: Path, folder: Path) -> Path:
     """The same recording as a LeRobot set with one mp4 an episode."""
     with data.open_source(path) as source:
-        writer = LeRobotWriter(
-            folder, source, {}, keep="numbers", encoding="h264", prefix="front", instead=False
-        )
-        for name in source.episodes:
-            writer.begin(name, LENGTH, {})
-            for block in _blocks(source, name):
-                writer.add(block, {})
-            writer.end()
-        writer.complete()
+        with output.begun(folder, {}) as partial:
+            with LeRobotWriter(
+                partial, source, keep="numbers", encoding="h264", prefix="front", instead=False
+            ) as writer:
+                for name in source.episodes:
+                    writer.begin(name, LENGTH, {})
+                    for block in _blocks(source, name):
+                        writer.add(block, {})
+                    writer.end()
+                content = writer.complete()
+            partial.publish(content)
     path.unlink()
     return folder
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,7 +17,14 @@ from scipy.spatial.transform import Rotation
 
 from palm_jax.align import AlignSpec
 from palm_jax.train import data
-from palm_jax.train.data import aligning, job, output, robomimic_writer, soundness
+from palm_jax.train.data import (
+    aligning,
+    job,
+    lerobot_writer,
+    output,
+    robomimic_writer,
+    soundness,
+)
 from palm_jax.train.data.errors import DataError, EpisodeLengthError, OutputError, TruncatedError
 from palm_jax.train.data.job import Options
 from palm_jax.train.data.recording import Recording, open_recording
@@ -290,14 +298,98 @@ def test_keeping_nothing_with_filter_keys(tmp_path: Path) -> None:
         assert list(file["mask/train"][()]) == [b"demo_1"]
 
 
-def test_an_aligned_file_can_be_aligned_again(aligned: Path) -> None:
-    """Its poses are known; robomimic's readers and this one see the same keys."""
-    from palm_jax.train.data.recording import robot_keys
+AGAIN = dataclasses.replace(
+    datasets.robosuite(), robot=data.RobotKeys(pose="palm_tcp", opening="palm_opening")
+)
+"""For what has been aligned: its own poses."""
 
-    with data.open_source(aligned) as source:
-        assert source.image_keys == ["obs/palm_image"]
-        keys = robot_keys(source, data.RobotKeys(pose="palm_tcp", opening="palm_opening"))
-    assert (keys.rotation, keys.open) == ("matrix", 1.0)
+
+@pytest.mark.parametrize("keep", ["numbers", "all", "none"])
+@pytest.mark.parametrize("format", ["robomimic", "lerobot"])
+def test_an_aligned_file_can_be_aligned_again(
+    keep: str, format: str, aligned: Path, tmp_path: Path
+) -> None:
+    """From its own poses, with the same result beside the first one."""
+    both, out = tmp_path / "both.hdf5", tmp_path / "out"
+    with open_recording(datasets.LIFT, datasets.robosuite()) as recording:
+        data.align_file(recording, SPEC, both, Options(keep="all"))
+    with open_recording(both, AGAIN, camera="agentview") as recording:
+        if keep == "all" and format == "lerobot":
+            return
+        options = Options(format=format, keep=keep, prefix="palm" if keep == "none" else "second")
+        data.align_file(recording, SPEC, out, options)
+    first = arrays(aligned, "demo_1")
+    if format == "lerobot":
+        columns = table_of(out, "data/chunk-000/file-000.parquet")
+        for key in ["palm_actions"] * (keep != "none") + [f"action.{options.prefix}"]:
+            np.testing.assert_allclose(columns[key][15:], first["palm_actions"], atol=2e-6)
+        return
+    second = arrays(out, "demo_1")
+    assert len(second) == len(OURS) + {"none": 0, "numbers": 16, "all": 18}[keep]
+    for key in OURS:
+        kept = second[key.replace("palm", options.prefix)]
+        np.testing.assert_allclose(kept, first[key], atol=2e-6 if kept.dtype.kind == "f" else 1)
+        if keep == "all":
+            np.testing.assert_array_equal(second[key], first[key])
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "name"),
+    [
+        ({"keep": "all"}, {}, "obs/palm_proprio"),
+        ({"keep": "all"}, {"keep": "all"}, "obs/palm_image"),
+        ({"keep": "all", "instead": True}, {"prefix": "p", "instead": True}, "source_actions"),
+        ({"keep": "all", "prefix": "p"}, {"prefix": "p"}, "obs/p_proprio"),
+    ],
+)
+def test_names_that_would_be_there_twice(
+    first: dict, second: dict, name: str, lift: Recording, tmp_path: Path
+) -> None:
+    data.align_file(lift, SPEC, tmp_path / "first", Options(**first))
+    with open_recording(tmp_path / "first", datasets.robosuite(), camera="agentview") as recording:
+        with pytest.raises(OutputError, match=f"{name}.* would be in the output twice.*--prefix"):
+            data.align_file(recording, SPEC, tmp_path / "second", Options(**second))
+    assert [path.name for path in tmp_path.iterdir()] == ["first"]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "name"),
+    [
+        ({}, {}, "observation.palm_proprio"),
+        ({"encoding": "h264"}, {"keep": "all"}, "observation.images.palm"),
+        ({"instead": True}, {"prefix": "p", "instead": True}, "source_state"),
+    ],
+)
+def test_names_that_would_be_there_twice_in_a_set(
+    first: dict, second: dict, name: str, front: Path, tmp_path: Path
+) -> None:
+    calibration = datasets.lerobot_calibration()
+    with open_recording(front, calibration) as recording:
+        data.align_file(recording, SPEC, tmp_path / "first", Options(keep="all", **first))
+    if first.get("instead"):
+        calibration = datasets.lerobot_calibration(
+            pose="source_state[0:6]", opening="source_state[6]"
+        )
+    with open_recording(tmp_path / "first", calibration, camera="front") as recording:
+        with pytest.raises(OutputError, match=f"{name}.* would be in the output twice.*--prefix"):
+            data.align_file(recording, SPEC, tmp_path / "second", Options(**second))
+        # Of a video and a column with the same last word neither is lost.
+        made = Options(keep="all", prefix="second")
+        data.align_file(recording, SPEC, tmp_path / "second", made)
+    names = [
+        set(json.loads((tmp_path / step / "meta/info.json").read_text())["features"])
+        for step in ("first", "second")
+    ]
+    new = {f"observation.second_{key}" for key in ("proprio", "valid", "tcp", "opening")}
+    assert names[1] - names[0] == {"observation.images.second", "action.second"} | new
+    assert names[0] <= names[1]
+    assert data.verify(tmp_path / "second", robot=calibration.robot) == {}
+
+
+@pytest.mark.parametrize("prefix", ["../x", "a/b", "", "a.b"])
+def test_prefixes_are_words(prefix: str) -> None:
+    with pytest.raises(OutputError, match="prefix: expected letters"):
+        Options(prefix=prefix)
 
 
 # -- LeRobot ---------------------------------------------------------------------------------------
@@ -436,6 +528,10 @@ def same(first: Path, second: Path) -> None:
             np.testing.assert_array_equal(value, other[key], err_msg=key)
 
 
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 class Stop:
     """Progress that presses Ctrl-C after so many frames."""
 
@@ -455,20 +551,19 @@ def test_stopped_and_resumed(format: str, after: int, tmp_path: Path) -> None:
     source, whole, stopped = datasets.LIFT, tmp_path / "whole", tmp_path / "stopped"
     before = datasets.digest(source)
 
-    def run(out: Path, **more: Any) -> job.Result:
+    def run(out: Path, spec: AlignSpec = SPEC, **more: Any) -> job.Result:
         with open_recording(source, datasets.robosuite()) as recording:
-            return data.align_file(recording, SPEC, out, options, **more)
+            return data.align_file(recording, spec, out, options, **more)
 
     run(whole)
     with pytest.raises(KeyboardInterrupt):
         run(stopped, progress=Stop(after))
     assert not stopped.exists() and output.partial_path(stopped).exists()
-    with (
-        open_recording(source, datasets.robosuite()) as recording,
-        pytest.raises(OutputError, match="begun with spec = .*delete it"),
-    ):
-        other = dataclasses.replace(SPEC, size=64)
-        data.align_file(recording, other, stopped, options)
+    if after:
+        left = contents(output.partial_path(stopped))
+        with pytest.raises(OutputError, match="begun with spec = .*delete it"):
+            run(stopped, spec=dataclasses.replace(SPEC, size=64))
+        assert contents(output.partial_path(stopped)) == left
     result = run(stopped)
     assert result.resumed == (1 if after else 0)
     same(whole, stopped)
@@ -476,21 +571,168 @@ def test_stopped_and_resumed(format: str, after: int, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
 
 
-@pytest.mark.parametrize("damage", ["cut", "episode"])
-def test_a_damaged_partial_is_made_again(damage: str, aligned: Path, tmp_path: Path) -> None:
+def damaged(partial: Path, damage: str) -> None:
+    """What a kill, or bits that flip, may leave of the first episode."""
+    if damage.startswith("hdf5"):
+        file = partial / "data.hdf5"
+        if damage == "hdf5 cut":
+            os.truncate(file, 20_000)
+            return
+        if damage == "hdf5 taken over":  # killed while it went on with an earlier file
+            file.rename(partial / "left.hdf5")
+            file.write_bytes(b"half")
+            return
+        with h5py.File(file, "r+") as content:
+            key = "obs/palm_proprio" if damage == "hdf5 new" else "obs/robot0_eef_pos"
+            content[f"data/demo_0/{key}"][3, 2] += 0.1
+        return
+    pattern = {"note": "*.json", "table": "*.parquet", "video": "*.mp4"}[damage.split()[0]]
+    (file,) = [f for f in partial.rglob(pattern) if f.name != output.RECIPE and "1" not in f.name]
+    if damage.endswith("gone"):
+        file.unlink()
+    elif damage.endswith("cut"):
+        os.truncate(file, file.stat().st_size // 2)
+    else:
+        content = bytearray(file.read_bytes())
+        content[len(content) // 2] ^= 1
+        file.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("damage", "resumed"),
+    [("hdf5 cut", 0), ("hdf5 new", 0), ("hdf5 kept", 0), ("hdf5 taken over", 1), ("note cut", 0),
+     ("note gone", 0), ("table cut", 0), ("table flipped", 0), ("video cut", 0), ("video gone", 0),
+     ("video flipped", 0)],
+)  # fmt: skip
+def test_a_damaged_partial_is_made_again(damage: str, resumed: int, tmp_path: Path) -> None:
     """Killed without a chance to close the file, or bits that flipped since."""
-    out = tmp_path / "out.hdf5"
-    partial = output.partial_path(out)
+    options = Options(
+        format="robomimic" if damage.startswith("hdf5") else "lerobot",
+        encoding="h264" if damage.startswith("video") else "png",
+    )
+    # Twice the same images: of 84 pixels x264 does not make twice the same bytes.
+    spec = dataclasses.replace(SPEC, size=128) if damage.startswith("video") else SPEC
+    whole, out = tmp_path / "whole", tmp_path / "out"
     with open_recording(datasets.LIFT, datasets.robosuite()) as recording:
+        data.align_file(recording, spec, whole, options)
         with pytest.raises(KeyboardInterrupt):
-            data.align_file(recording, SPEC, out, progress=Stop(20))
-        if damage == "cut":
-            partial.write_bytes(partial.read_bytes()[:20_000])
-        else:
-            with h5py.File(partial, "r+") as file:
-                file["data/demo_0/obs/palm_proprio"][3, 2] += 0.1
-        assert data.align_file(recording, SPEC, out).resumed == 0
-    same(aligned, out)
+            data.align_file(recording, spec, out, options, progress=Stop(20))
+        damaged(output.partial_path(out), damage)
+        assert data.align_file(recording, spec, out, options).resumed == resumed
+    same(whole, out)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
+
+
+@pytest.mark.parametrize("format", ["robomimic", "lerobot"])
+def test_one_process_writes_an_output(format: str, lift: Recording, tmp_path: Path) -> None:
+    """A second one is refused and changes nothing, whatever it wants to write."""
+    options, out, whole = Options(format=format), tmp_path / "out", tmp_path / "whole"
+    refused = []
+
+    def second(frames: int) -> None:
+        before = contents(output.partial_path(out))
+        for write in (
+            lambda: data.align_file(lift, SPEC, out, options, trust=True),
+            lambda: data.repair(datasets.LIFT, out),
+        ):
+            with pytest.raises(OutputError, match="another process is writing .*--out"):
+                write()
+            refused.append(frames)
+        assert contents(output.partial_path(out)) == before
+
+    data.align_file(lift, SPEC, whole, options)
+    with open_recording(datasets.LIFT, datasets.robosuite()) as recording:
+        data.align_file(recording, SPEC, out, options, progress=second)
+    assert len(refused) >= 4
+    same(whole, out)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
+
+
+@pytest.mark.parametrize("format", ["robomimic", "lerobot"])
+def test_an_output_that_appears_in_the_meantime(
+    format: str, lift: Recording, tmp_path: Path
+) -> None:
+    """It is not overwritten, and the hours of work are not lost."""
+    options, out, whole = Options(format=format), tmp_path / "out", tmp_path / "whole"
+    data.align_file(lift, SPEC, whole, options)
+
+    def appear(frames: int) -> None:
+        out.write_text("mine")
+
+    with pytest.raises(OutputError, match="has appeared in the meantime.*move it"):
+        data.align_file(lift, SPEC, out, options, progress=appear)
+    assert out.read_text() == "mine"
+    out.unlink()
+    assert data.align_file(lift, SPEC, out, options).resumed == 2
+    same(whole, out)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
+
+
+@pytest.mark.parametrize("left", ["other format", "folder", "file", "link", "align"])
+def test_what_is_in_the_way_is_not_deleted(left: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    partial = output.partial_path(out)
+    words = "is none of ours.*delete it"
+    if left == "folder":
+        partial.mkdir()
+        (partial / "data.hdf5").write_text("precious")
+    elif left == "file":
+        partial.write_text("precious")
+    elif left == "link":
+        partial.symlink_to(tmp_path / "nowhere")
+    else:
+        with open_recording(datasets.LIFT, datasets.robosuite()) as recording:
+            with pytest.raises(KeyboardInterrupt):
+                data.align_file(recording, SPEC, out, progress=Stop(20))
+        words = "begun by another" if left == "align" else "was begun with options"
+    before = {partial: partial.read_bytes()} if left == "file" else contents(partial)
+    if left == "align":
+        with pytest.raises(OutputError, match=words):
+            data.repair(datasets.LIFT, out)
+    else:
+        options = Options(format="lerobot" if left == "other format" else "robomimic")
+        with open_recording(datasets.LIFT, datasets.robosuite()) as recording:
+            with pytest.raises(OutputError, match=words):
+                data.align_file(recording, SPEC, out, options, trust=True)
+    after = {partial: partial.read_bytes()} if left == "file" else contents(partial)
+    assert after == before and not out.exists() and os.path.lexists(partial)
+
+
+def test_a_folder_with_nothing_but_its_recipe_is_in_nobodys_way(
+    lift: Recording, tmp_path: Path
+) -> None:
+    """Killed between giving the output its name and removing the folder; or before it was there."""
+    out = tmp_path / "out"
+    with output.begun(out, {"another": "command"}):
+        pass
+    (tmp_path / ".out.partial.new").mkdir()
+    (tmp_path / ".out.partial.lock").touch()
+    data.align_file(lift, SPEC, out)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("command", ["align", "repair"])
+def test_a_copy_of_a_video_that_was_interrupted(
+    command: str, front: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def half(file: Path, target: Path) -> None:
+        target.write_bytes(file.read_bytes()[:3000])
+        raise KeyboardInterrupt
+
+    def run() -> None:
+        if command == "repair":
+            data.repair(front, tmp_path / "out", robot=datasets.lerobot_calibration().robot)
+            return
+        with open_recording(front, datasets.lerobot_calibration()) as recording:
+            data.align_file(recording, SPEC, tmp_path / "out", Options(keep="all"))
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(lerobot_writer.shutil, "copyfile", half)
+        run()
+    run()
+    (video,), (copied,) = front.rglob("*.mp4"), (tmp_path / "out").rglob("*.mp4")
+    assert copied.read_bytes() == video.read_bytes()
+    assert data.verify(tmp_path / "out") == {}
 
 
 def test_outputs_are_never_overwritten(lift: Recording, aligned: Path, front: Path) -> None:

@@ -503,6 +503,8 @@ def run_align(config: Align, console: Console) -> int:
         f"{spec.proprio_size} numbers ({spec.layout})",
         markup=False,
     )
+    for key, why in result.skipped.items():
+        console.print(f"not kept: {key} ({why})", markup=False)
     console.print(f"written: {result.path}", markup=False)
     return 0
 

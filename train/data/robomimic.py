@@ -12,7 +12,7 @@ import json
 import os
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -73,7 +73,8 @@ def _stored(error: OSError) -> str:
 
 def is_image(dataset: h5py.Dataset) -> bool:
     """Whether a data set of an episode holds colour images."""
-    shape, dtype = dataset.shape, dataset.dtype
+    shape: tuple[int, ...] = dataset.shape or ()
+    dtype = dataset.dtype
     return bool(len(shape) == 4 and shape[-1] == 3 and dtype == np.uint8 and min(shape[1:3]) > 4)
 
 
@@ -198,6 +199,24 @@ class RobomimicSource(Source):
 
     def features(self) -> dict[str, Feature]:
         return self._features
+
+    def in_all(self, episodes: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+        found: dict[str, list[Any]] = {}
+        for name in episodes:
+            length = self.length(name)
+            for key, dataset in self.datasets(name, every=True):
+                if key.startswith("next_obs/") or is_image(dataset):
+                    continue
+                fits = dataset.dtype.kind in "biuf" and (dataset.shape or ())[:1] == (length,)
+                kind = (dataset.shape[1:], dataset.dtype) if fits else None
+                found.setdefault(key, []).append(kind)
+        why = {}
+        for key, kinds in found.items():
+            if None in kinds:
+                why[key] = "no numbers with a row for each frame"
+            elif len(kinds) < len(episodes) or len(set(kinds)) > 1:
+                why[key] = "not the same in all episodes"
+        return [key for key in found if key not in why], why
 
     def numbers(self, episode: str, key: str) -> np.ndarray:
         values: np.ndarray = self._read(self._dataset(episode, key), slice(None))

@@ -168,29 +168,23 @@ def repair(path: Path, out: Path, *, robot: RobotKeys | None = None) -> Repair:
       DiskFullError: no space.
     """
     output.check_free(out, path)
-    partial = output.partial_path(out)
-    output.remove(partial)
-    with robomimic_writer.writing(out):
-        try:
-            with _opened(path) as source:
-                problems = {
-                    name: found
-                    for name in source.episodes
-                    if (found := _unsound(source, name, robot or RobotKeys()))
-                }
-                kept = [name for name in source.episodes if name not in problems]
-                if not kept:
-                    reasons = "; ".join(f"{n}: {r[0]}" for n, r in list(problems.items())[:3])
-                    raise OutputError(f"{path}: no sound episode to save ({reasons})")
-                note = {"repaired": fingerprint(path, source.files()), "dropped": problems}
-                if isinstance(source, RobomimicSource):
-                    _copy_hdf5(source, kept, partial, note)
-                    output.publish(partial, out)
-                else:
-                    _copy_lerobot(source, kept, out, note)
-        except BaseException:
-            output.remove(partial)
-            raise
+    with robomimic_writer.writing(out), _opened(path) as source:
+        problems = {
+            name: found
+            for name in source.episodes
+            if (found := _unsound(source, name, robot or RobotKeys()))
+        }
+        kept = [name for name in source.episodes if name not in problems]
+        if not kept:
+            reasons = "; ".join(f"{n}: {r[0]}" for n, r in list(problems.items())[:3])
+            raise OutputError(f"{path}: no sound episode to save ({reasons})")
+        note = {"repaired": fingerprint(path, source.files()), "dropped": problems}
+        with output.begun(out, note) as partial:
+            if isinstance(source, RobomimicSource):
+                content = _copy_hdf5(source, kept, partial)
+            else:
+                content = _copy_lerobot(source, kept, partial)
+            partial.publish(content)
     return Repair(out, tuple(kept), {name: reasons[0] for name, reasons in problems.items()})
 
 
@@ -302,14 +296,14 @@ def _end(dataset: h5py.Dataset) -> int:
     return max(ends)
 
 
-def _copy_hdf5(
-    source: RobomimicSource, kept: list[str], partial: Path, note: dict[str, Any]
-) -> None:
-    with h5py.File(partial, "w") as file:
+def _copy_hdf5(source: RobomimicSource, kept: list[str], partial: output.Partial) -> Path:
+    path = partial.folder / "data.hdf5"
+    path.unlink(missing_ok=True)
+    with h5py.File(path, "w") as file:
         data = file.create_group("data")
         for key, value in source.data.attrs.items():
             data.attrs[key] = value
-        data.attrs["palm_repair"] = json.dumps(note)
+        data.attrs["palm_repair"] = json.dumps(partial.recipe)
         data.attrs["total"] = sum(source.length(name) for name in kept)
         numbers = {}
         for index, name in enumerate(sorted(kept, key=by_number)):
@@ -320,6 +314,7 @@ def _copy_hdf5(
             _renamed_masks(source.file, file, numbers)
         except (OSError, RuntimeError, KeyError):
             pass  # beyond the end: filter keys can be made again
+    return path
 
 
 def _renamed_masks(old: h5py.File, new: h5py.File, numbers: Mapping[str, str]) -> None:
@@ -328,13 +323,13 @@ def _renamed_masks(old: h5py.File, new: h5py.File, numbers: Mapping[str, str]) -
         new[f"mask/{key}"] = np.array(names, dtype="S")
 
 
-def _copy_lerobot(source: Source, kept: list[str], out: Path, note: dict[str, Any]) -> None:
+def _copy_lerobot(source: Source, kept: list[str], partial: output.Partial) -> Path:
     if not isinstance(source, LeRobotSource):
         raise FormatError(f"{source.path}: nothing known to repair")
-    writer = LeRobotWriter(
-        out, source, note, keep="all", encoding="png", prefix="palm", instead=False, episodes=kept
-    )
-    for name in kept:
-        writer.begin(name, source.length(name), {})
-        writer.end()
-    writer.complete()
+    with LeRobotWriter(
+        partial, source, keep="all", encoding="png", prefix="palm", instead=False, episodes=kept
+    ) as writer:
+        for name in kept[len(writer.done) :]:
+            writer.begin(name, source.length(name), {})
+            writer.end()
+        return writer.complete()
