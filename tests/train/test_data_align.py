@@ -19,6 +19,7 @@ from palm_jax.align import AlignSpec
 from palm_jax.train import data
 from palm_jax.train.data import (
     aligning,
+    commands,
     job,
     lerobot_writer,
     output,
@@ -508,6 +509,138 @@ def test_from_lerobot_and_back(front: Path, aligned: Path, tmp_path: Path) -> No
     rows = table_of(tmp_path / "set", "meta/episodes/chunk-000/file-000.parquet")
     starts = rows["videos/observation.images.front/from_timestamp"]
     assert starts == [0.0, pytest.approx(0.75)]
+
+
+def changed_set(folder: Path, columns: dict[str, Any], features: dict[str, Any]) -> Path:
+    """The LeRobot set with columns put in, and declared."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    root = datasets.lerobot(folder)
+    file = root / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(file)
+    for name, values in columns.items():
+        if name in table.column_names:
+            table = table.drop_columns([name])
+        table = table.append_column(name, pa.array(values))
+    pq.write_table(table, file)
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"] |= features
+    (root / "meta/info.json").write_text(json.dumps(info))
+    return root
+
+
+def with_stats(root: Path) -> None:
+    wrong = {"min": [-99.0] * 7, "max": [99.0] * 7, "mean": [None] * 7, "std": [0.0] * 7}
+    image = {"mean": [[[0.5]]] * 3, "count": [33]}
+    stats = {"observation.state": wrong | {"count": [33]}, "observation.images.front": image}
+    (root / "meta/stats.json").write_text(json.dumps(stats))
+
+
+@pytest.mark.parametrize("kept", [1, 2])
+def test_statistics_are_those_of_what_is_kept(kept: int, tmp_path: Path) -> None:
+    """Those of images, which nobody has looked at, are kept for as long as they are right."""
+    (tmp_path / "old").mkdir()
+    columns = table_of(datasets.lerobot(tmp_path / "old"), "data/chunk-000/file-000.parquet")
+    state = np.array(columns["observation.state"])
+    if kept == 1:
+        state[20, 3] = np.nan
+    root = changed_set(tmp_path, {"observation.state": state.astype(np.float32).tolist()}, {})
+    with_stats(root)
+    robot = datasets.lerobot_calibration().robot
+    assert len(data.repair(root, tmp_path / "new", robot=robot).kept) == kept
+    stats = json.loads((tmp_path / "new/meta/stats.json").read_text())
+    rows = state[:15] if kept == 1 else state
+    for name in ("min", "max", "mean", "std"):
+        expected = getattr(rows.astype(np.float32).astype(float), name)(0)
+        np.testing.assert_allclose(stats["observation.state"][name], expected, atol=1e-9)
+    assert stats["observation.state"]["count"] == [len(rows)]
+    assert ("observation.images.front" in stats) == (kept == 2)
+
+
+@pytest.mark.parametrize("command", ["align", "repair"])
+def test_tasks_and_times_of_every_frame_are_kept(command: str, tmp_path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    index, times = [1] * 8 + [0] * 7 + [2] * 18, [i / 20 + 0.003 for i in [*range(15), *range(18)]]
+    columns = {"task_index": index, "timestamp": np.array(times, np.float32)}
+    root = changed_set(tmp_path, columns, {})
+    words = ["place", "lift", "wave", "unused"]
+    pq.write_table(
+        pa.table({"task_index": [0, 1, 2, 3], "task": words}), root / "meta/tasks.parquet"
+    )
+    episodes = root / "meta/episodes/chunk-000/file-000.parquet"
+    rows = pq.read_table(episodes).to_pylist()
+    rows[0]["tasks"], rows[1]["tasks"] = ["lift", "place"], ["wave"]
+    pq.write_table(pa.Table.from_pylist(rows), episodes)
+    out = tmp_path / "out"
+    if command == "repair":
+        data.repair(root, out, robot=datasets.lerobot_calibration().robot)
+    else:
+        with open_recording(root, datasets.lerobot_calibration()) as recording:
+            data.align_file(recording, SPEC, out)
+    got = table_of(out, "data/chunk-000/file-000.parquet")
+    found = pq.read_table(out / "meta/tasks.parquet").to_pydict()
+    assert found == {"task_index": [0, 1, 2], "task": words[:3]}
+    assert got["task_index"] == index
+    np.testing.assert_array_equal(got["timestamp"], columns["timestamp"])
+    tasks = table_of(out, "meta/episodes/chunk-000/file-000.parquet")["tasks"]
+    assert tasks == [["lift", "place"], ["wave"]]
+
+
+def test_what_robomimic_cannot_hold_is_left_out_and_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    depth = {"dtype": "video", "shape": [128, 128, 3], "names": None}
+    features = {
+        "language_instruction": {"dtype": "string", "shape": [1], "names": None},
+        "observation.depth": depth | {"info": {"is_depth_map": True}},
+    }
+    root = changed_set(tmp_path, {"language_instruction": ["lift"] * 33}, features)
+    path = data.save_calibration(datasets.lerobot_calibration(), tmp_path / "c.json")
+    words = ["align", root, "--calibration", path, "--out", tmp_path / "new.hdf5"]
+    assert commands.main([*map(str, words), "--format", "robomimic"]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "not kept: language_instruction (string, not numbers)" in told
+    assert "not kept: observation.depth (video, not numbers)" in told
+    found = arrays(tmp_path / "new.hdf5")
+    assert found["obs/state"].shape == (15, 7) and "obs/language_instruction" not in found
+    with open_recording(root, datasets.lerobot_calibration()) as recording:
+        data.align_file(recording, SPEC, tmp_path / "new")
+    kept = table_of(tmp_path / "new", "data/chunk-000/file-000.parquet")
+    assert kept["language_instruction"] == ["lift"] * 33
+
+
+def test_what_lerobot_cannot_hold_is_left_out_and_told(tmp_path: Path) -> None:
+    def add(file: h5py.File) -> None:
+        for number, demo in enumerate(file["data"].values()):
+            length = len(demo["actions"])
+            demo["camera_pose"] = np.eye(4)
+            demo["square"] = np.zeros((15, 3))  # by chance as many rows as the first has frames
+            demo["text"] = "lift"
+            demo["timestamp"] = np.arange(length)
+            demo["obs/note"] = np.array([b"x"] * length)
+            demo["obs/wide"] = np.zeros((length, 2 + number))
+            if number == 0:
+                demo["obs/first"] = np.zeros(length)
+            else:
+                demo["obs/second"] = np.zeros(length)
+            demo["obs/fine"] = np.arange(length)
+
+    path = datasets.changed(datasets.LIFT, tmp_path, add)
+    with open_recording(path, datasets.robosuite()) as recording:
+        result = data.align_file(recording, SPEC, tmp_path / "set", Options(format="lerobot"))
+    rows, same_kind = "no numbers with a row for each frame", "not the same in all episodes"
+    assert result.skipped == {
+        "camera_pose": rows, "square": rows, "text": rows, "obs/note": rows,
+        "obs/wide": same_kind, "obs/first": same_kind, "obs/second": same_kind,
+        "timestamp": "LeRobot has its own",
+    }  # fmt: skip
+    columns = table_of(tmp_path / "set", "data/chunk-000/file-000.parquet")
+    assert columns["observation.fine"] == [*range(15), *range(18)]
+    np.testing.assert_allclose(columns["timestamp"][:15], np.arange(15) * 0.15, atol=1e-6)
+    assert data.verify(tmp_path / "set") == {}
 
 
 # -- stopping and going on -------------------------------------------------------------------------

@@ -1,15 +1,20 @@
 """Readers: what they give is what the file holds, whatever its layout."""
 
+import io
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import datasets
 import h5py
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 
 from palm_jax.train.data import inspection, recording, source
 from palm_jax.train.data.errors import (
@@ -130,14 +135,9 @@ def test_lerobot_poses_are_those_of_the_original(lerobot: Path) -> None:
         np.testing.assert_allclose(first.trajectory("demo_0").opening, grip, atol=1e-12)
 
 
-def test_images_inside_of_tables(tmp_path: Path) -> None:
-    import io
-
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-    from PIL import Image
-
-    root = datasets.lerobot(tmp_path)
+def pictures_in_tables(folder: Path, **options: Any) -> tuple[Path, list[np.ndarray]]:
+    """The set with its images as PNG in the table, made by Pillow and pyarrow; and the images."""
+    root = datasets.lerobot(folder)
     info = json.loads((root / "meta/info.json").read_text())
     info["features"][KEY] |= {"dtype": "image"}
     (root / "meta/info.json").write_text(json.dumps(info))
@@ -150,12 +150,58 @@ def test_images_inside_of_tables(tmp_path: Path) -> None:
         Image.fromarray(image).save(content, "PNG")
         pictures.append({"bytes": content.getvalue(), "path": "x.png"})
     file = root / "data/chunk-000/file-000.parquet"
-    table = pq.read_table(file).append_column(KEY, pa.array(pictures))
-    pq.write_table(table, file)
+    pq.write_table(pq.read_table(file).append_column(KEY, pa.array(pictures)), file, **options)
+    return root, images
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"row_group_size": 15}, {"row_group_size": 10, "data_page_size": 1},
+     {"row_group_size": 20, "write_statistics": False}],
+)  # fmt: skip
+def test_images_inside_of_tables(options: dict[str, Any], tmp_path: Path) -> None:
+    """However the table is cut into groups of rows."""
+    root, images = pictures_in_tables(tmp_path, **options)
     with open_source(root) as data:
-        got = np.concatenate([b for n in data.episodes for b in data.blocks(n, KEY, 8)])
-        np.testing.assert_array_equal(got, images)
+        blocks = [block for name in data.episodes for block in data.blocks(name, KEY, 8)]
+        assert [len(block) for block in blocks] == [8, 7, 8, 8, 2]
+        np.testing.assert_array_equal(np.concatenate(blocks), images)
         np.testing.assert_array_equal(data.image("1", KEY, 2), images[data.length("0") + 2])
+
+
+def test_images_inside_of_tables_are_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of every picture the bytes go once through the reader: not the column for each block."""
+    root, images = pictures_in_tables(tmp_path, row_group_size=33)
+    decoded = []
+
+    def batches(file: Any, *args: Any, **options: Any) -> Any:
+        for batch in read(file, *args, **options):
+            decoded.append(len(batch))
+            yield batch
+
+    read = pq.ParquetFile.iter_batches
+    with open_source(root) as data:
+        monkeypatch.setattr(pq.ParquetFile, "iter_batches", batches)
+        monkeypatch.setattr(pq, "read_table", lambda *args, **options: pytest.fail("read whole"))
+        assert len(np.concatenate(list(data.blocks("1", KEY, 4)))) == 18
+        assert sum(decoded) == 33
+        decoded.clear()
+        data.image("0", KEY, 3)
+        assert sum(decoded) <= 8
+
+
+def test_a_table_with_too_few_rows(tmp_path: Path) -> None:
+    root, _ = pictures_in_tables(tmp_path)
+    file = root / "data/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(file).slice(0, 30), file)
+    with open_source(root) as data:
+        assert len(np.concatenate(list(data.blocks("0", KEY, 8)))) == 15
+        with pytest.raises(TruncatedError, match="episode 1 has 15 rows, meta/episodes says 18"):
+            list(data.blocks("1", KEY, 8))
+        with pytest.raises(KeyMissingError, match="no column 'other'"):
+            data.column("1", "other")
 
 
 def test_a_video_that_ends_early(tmp_path: Path) -> None:
