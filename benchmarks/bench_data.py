@@ -5,10 +5,10 @@ frames read and decompressed, aligned, compressed (gzip, level 1), checksummed a
 disk. The look for flipped images is left out: it takes the same seconds whatever the size of the
 file. The files are in the system's cache when they are read.
 
-`layouts`: for HDF5 the images as they are (raw), or a frame a chunk compressed by gzip or lzf; raw
-with lens coefficients, so that frames are undistorted first; an mp4 (H.264) of a LeRobot set, where
-PyAV and pyarrow are installed. `peak_mb` is the memory of the
-process.
+`layouts`: for HDF5 the images as they are (raw), or a frame a chunk compressed by gzip or lzf, or
+gzip with h5py's own chunks, which cut frames into pieces; raw with lens coefficients, so that
+frames are undistorted first; an mp4 (H.264) of a LeRobot set, where PyAV and pyarrow are installed.
+`peak_mb` is the memory of the process.
 """
 
 import importlib.util
@@ -32,6 +32,7 @@ EPISODES, LENGTH, FRAME, DISTINCT = 4, 256, 512, 32
 LAYOUTS: dict[str, dict[str, Any]] = {
     "raw": {},
     "gzip": {"compression": "gzip", "chunks": (1, FRAME, FRAME, 3)},
+    "pieces": {"compression": "gzip"},  # h5py's own chunks, as robomimic's --compress has them
     "lzf": {"compression": "lzf", "chunks": (1, FRAME, FRAME, 3)},
 }
 FOVY = 45.0

@@ -1,13 +1,13 @@
 """Robomimic's HDF5 files: `data/demo_i/{actions, states, obs/*}`, images uint8 [T, H, W, 3].
 
-Reading is bound by decompression where images are compressed: chunks of whole frames are then
-decompressed in threads, which h5py by itself does not do, and by `isal`, where that is installed,
-in half the time.
+Reading is bound by decompression where images are compressed: their chunks are then decompressed in
+threads, which h5py by itself does not do, and by `isal`, where that is installed, in half the time.
 """
 
 from __future__ import annotations
 
 import importlib
+import itertools
 import json
 import os
 import re
@@ -25,7 +25,7 @@ from palm_jax.train.data.errors import FormatError, KeyMissingError, TruncatedEr
 from palm_jax.train.data.source import Feature, Source
 
 CACHE_BYTES = 64 * 2**20
-"""For chunks that are larger than a block or cut frames into pieces."""
+"""For chunks that are not read past HDF5, and larger than a block or pieces of frames."""
 
 DEFAULT_FPS = 20.0
 
@@ -238,7 +238,7 @@ class RobomimicSource(Source):
         # Whole chunks, so that none is decompressed twice.
         size = max(1, size // per_chunk) * per_chunk
         read = self._read
-        if _whole_gzip(dataset):
+        if _is_gzip(dataset):
             read = self._gzipped
         elif self._plain(dataset):
             read = self._copied
@@ -273,23 +273,27 @@ class RobomimicSource(Source):
     def _gzipped(self, dataset: h5py.Dataset, rows: slice) -> np.ndarray:
         """Rows, decompressed in threads (zlib lets the others run, HDF5 does not)."""
         self._pool = self._pool or ThreadPoolExecutor(min(4, os.cpu_count() or 1))
-        per_chunk, zeros = dataset.chunks[0], (0,) * (dataset.ndim - 1)
-        block = np.empty((rows.stop - rows.start, *dataset.shape[1:]), np.uint8)
+        shape, chunk = dataset.shape, dataset.chunks
+        block = np.empty((rows.stop - rows.start, *shape[1:]), np.uint8)
 
-        def decompress(first: int, packed: bytes) -> None:
-            frames = np.frombuffer(_INFLATER.decompress(packed), np.uint8)
-            frames = frames.reshape(dataset.chunks)[: rows.stop - first]
-            block[first - rows.start : first - rows.start + len(frames)] = frames
+        def decompress(place: tuple[int, ...], packed: bytes) -> None:
+            part = np.frombuffer(_INFLATER.decompress(packed), np.uint8).reshape(chunk)
+            ends = (rows.stop, *shape[1:])  # a chunk at an edge is whole, and goes beyond it
+            sizes = [min(c, end - at) for c, end, at in zip(chunk, ends, place, strict=True)]
+            begins = (place[0] - rows.start, *place[1:])
+            target = tuple(slice(at, at + n) for at, n in zip(begins, sizes, strict=True))
+            block[target] = part[tuple(map(slice, sizes))]
 
+        steps = [range(0, size, step) for size, step in zip(shape[1:], chunk[1:], strict=True)]
         jobs = []
-        for first in range(rows.start, rows.stop, per_chunk):
+        for place in itertools.product(range(rows.start, rows.stop, chunk[0]), *steps):
             try:
-                mask, packed = dataset.id.read_direct_chunk((first, *zeros))
+                mask, packed = dataset.id.read_direct_chunk(place)
             except (OSError, RuntimeError):
                 return self._read(dataset, rows)  # never written: zeros, or the error with advice
             if mask:  # this chunk was stored without the filter
                 return self._read(dataset, rows)
-            jobs.append(self._pool.submit(decompress, first, packed))
+            jobs.append(self._pool.submit(decompress, place, packed))
         try:
             for job in jobs:
                 job.result()
@@ -340,12 +344,11 @@ def _feature(dataset: h5py.Dataset) -> Feature:
     return Feature(tuple(dataset.shape[1:]), str(dataset.dtype), is_image(dataset))
 
 
-def _whole_gzip(dataset: h5py.Dataset) -> bool:
-    """Chunks of whole frames, compressed by gzip and nothing else. (Shuffling single bytes does
-    nothing, but may be there.)"""
+def _is_gzip(dataset: h5py.Dataset) -> bool:
+    """Chunks compressed by gzip and nothing else. (Shuffling single bytes does nothing, but may be
+    there.)"""
     return bool(
         dataset.compression == "gzip"
-        and dataset.chunks[1:] == dataset.shape[1:]
         and not dataset.fletcher32
         and dataset.scaleoffset is None
         and dataset.dtype == np.uint8
