@@ -912,6 +912,152 @@ def test_flipped_bits_are_found(aligned: Path, tmp_path: Path) -> None:
     assert "obs/palm_image is not what was written" in problem
 
 
+@pytest.mark.parametrize("keep", ["numbers", "all"])
+def test_every_array_has_a_checksum(keep: str, tmp_path: Path) -> None:
+    """What is kept of the source, too, whatever it is; computed by hashlib alone."""
+    import hashlib
+
+    def add(file: h5py.File) -> None:
+        demo = file["data/demo_1"]
+        demo["note"], demo["extra/matrix"] = "some words", np.eye(3)
+        demo["extra/words"] = np.array(["a", "bc"], object)
+        demo["next_obs/robot0_eef_pos"] = demo["obs/robot0_eef_pos"][()]
+
+    (tmp_path / "source").mkdir()
+    source = datasets.changed(datasets.LIFT, tmp_path / "source", add)
+    with open_recording(source, datasets.robosuite()) as recording:
+        data.align_file(recording, SPEC, tmp_path / "whole.hdf5", Options(keep=keep, instead=True))
+    keys = list(arrays(tmp_path / "whole.hdf5", "demo_1"))
+    assert {"note", "extra/words", "source_actions", "next_obs/robot0_eef_pos"} <= set(keys)
+    with h5py.File(tmp_path / "whole.hdf5") as file:
+        hashes = json.loads(file["data/demo_1"].attrs["palm_sha256"])
+        for key in ("obs/robot0_eef_pos", "extra/matrix", "obs/palm_image"):
+            values = file["data/demo_1"][key][()]
+            expected = hashlib.sha256(f"{values.dtype.str}{values.shape[1:]}".encode())
+            expected.update(values.tobytes())
+            assert hashes[key] == expected.hexdigest(), key
+    assert set(hashes) == set(keys) and data.verify(tmp_path / "whole.hdf5") == {}
+    for key in keys:
+        path = tmp_path / "flipped.hdf5"
+        shutil.copyfile(tmp_path / "whole.hdf5", path)
+        with h5py.File(path, "r+") as file:
+            dataset = file["data/demo_1"][key]
+            values = dataset[()]
+            if key == "note":
+                dataset[()] = "other words"
+            elif key == "extra/words":
+                dataset[1] = "b"
+            else:
+                raw = bytearray(np.ascontiguousarray(values).tobytes())
+                raw[len(raw) // 2 - len(raw) // 2 % values.dtype.itemsize] ^= 1
+                dataset[...] = np.frombuffer(bytes(raw), values.dtype).reshape(values.shape)
+        assert f"{key} is not what was written" in " ".join(data.verify(path)["demo_1"]), key
+
+
+@pytest.mark.parametrize("command", ["align", "repair"])
+def test_every_file_of_a_set_has_a_checksum(command: str, front: Path, tmp_path: Path) -> None:
+    import hashlib
+
+    root, robot = tmp_path / "set", datasets.lerobot_calibration().robot
+    if command == "repair":
+        data.repair(front, root, robot=robot)
+    else:
+        with open_recording(front, datasets.lerobot_calibration()) as recording:
+            options = Options(keep="all", encoding="h264")
+            data.align_file(recording, SPEC, root, options)
+    files = {str(p.relative_to(root)): p for p in root.rglob("*") if p.is_file()}
+    hashes = json.loads(files.pop("meta/palm.json").read_text())["sha256"]
+    assert hashes == {n: hashlib.sha256(p.read_bytes()).hexdigest() for n, p in files.items()}
+    assert data.verify(root, robot=robot) == {}
+    for name, path in files.items():
+        whole = path.read_bytes()
+        if name.endswith("json"):
+            path.write_bytes(whole.replace(b"1", b"2", 1))
+        elif name.endswith("mp4"):
+            path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+        else:
+            path.write_bytes(whole[:10] + bytes([whole[10] ^ 1]) + whole[11:])
+        try:
+            found = data.verify(root, robot=robot)[""]
+            assert f"{name} is not what was written (sha256)" in found
+        except DataError:
+            assert name.endswith(("parquet", "info.json"))  # cannot even be opened
+        path.unlink()
+        if name.startswith("videos/"):
+            assert any(name in text for text in data.verify(root, robot=robot)[""])
+        path.write_bytes(whole)
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"sha256": 3}', '{"sha256": {"../x": "0"}}'])
+def test_checksums_of_strangers(content: str, front: Path, tmp_path: Path) -> None:
+    root = tmp_path / "set"
+    shutil.copytree(front, root)
+    (root / "meta/palm.json").write_text(content)
+    (problem,) = data.verify(root)[""]
+    assert "meta/palm.json cannot be read" in problem or "leads out of the data set" in problem
+
+    def write(file: h5py.File) -> None:
+        file["data/demo_0"].attrs["palm_sha256"] = content
+
+    path = datasets.changed(datasets.LIFT, tmp_path, write)
+    assert any("palm_sha256 cannot" in t or "missing" in t for t in data.verify(path)["demo_0"])
+
+
+@pytest.mark.parametrize(
+    "key", ["next_obs/image", "next_obs/pos", "extra/deep/numbers", "extra/words", "obs/mask"]
+)
+def test_verify_reads_every_array(key: str, tmp_path: Path) -> None:
+    def add(file: h5py.File) -> None:
+        demo, options = file["data/demo_1"], {"compression": "gzip", "chunks": True}
+        if key.endswith("words"):
+            demo.create_dataset(key, data=np.array([b"abc"] * 18), **options)
+        elif key.endswith(("image", "mask")):
+            demo.create_dataset(
+                key, data=demo[datasets.IMAGES][..., : 3 - ("mask" in key)], **options
+            )
+        else:
+            demo.create_dataset(key, data=np.zeros((18, 3)), **options)
+
+    def damage(file: h5py.File) -> None:
+        dataset = file["data/demo_1"][key]
+        info = dataset.id.get_chunk_info(dataset.id.get_num_chunks() - 1)
+        dataset.id.write_direct_chunk(info.chunk_offset, b"\0" * 50)
+
+    path = datasets.changed(datasets.LIFT, tmp_path, add)
+    assert data.verify(path) == {}
+    with h5py.File(path, "r+") as file:
+        damage(file)
+    assert f"{key} cannot be read" in data.verify(path)["demo_1"][0]
+
+
+def test_verify_reads_filter_keys(tmp_path: Path) -> None:
+    def add(file: h5py.File) -> None:
+        names = np.array([b"demo_0"] * 100)
+        file.create_dataset("mask/train", data=names, compression="gzip")
+        file["mask/train"].id.write_direct_chunk((0,), b"\0" * 50)
+
+    (problem,) = data.verify(datasets.changed(datasets.LIFT, tmp_path, add))[""]
+    assert "mask/train cannot be read" in problem
+
+
+def test_verify_reads_every_column(tmp_path: Path) -> None:
+    """A page that is damaged in a column that nothing else needs."""
+    import pyarrow.parquet as pq
+
+    words = [f"word {number}" for number in range(33)]
+    features = {"words": {"dtype": "string", "shape": [1], "names": None}}
+    root = changed_set(tmp_path, {"words": words}, features)
+    assert data.verify(root) == {}
+    file = root / "data/chunk-000/file-000.parquet"
+    group = pq.read_metadata(file).row_group(0)
+    column = group.column(group.num_columns - 1)
+    content = bytearray(file.read_bytes())
+    begin = column.dictionary_page_offset or column.data_page_offset
+    content[begin : begin + 40] = bytes(40)
+    file.write_bytes(content)
+    assert "not a whole parquet file" in data.verify(root)["0"][0]
+
+
 def test_verify_finds_what_does_not_add_up(tmp_path: Path) -> None:
     def spoil(file: h5py.File) -> None:
         file["data"].attrs["total"] = 99

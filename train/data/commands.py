@@ -514,7 +514,7 @@ def run_align(config: Align, console: Console) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Verify:
-    """Is a data file whole? Reads everything.
+    """Is a data file whole? Reads everything; of videos it counts the frames.
 
     Attributes:
       file: robomimic HDF5 file, or folder of a LeRobot v3 data set.

@@ -28,6 +28,7 @@ CACHE_BYTES = 64 * 2**20
 """For chunks that are not read past HDF5, and larger than a block or pieces of frames."""
 
 DEFAULT_FPS = 20.0
+_ROWS = 64
 
 
 def _inflater() -> Any:
@@ -231,6 +232,27 @@ class RobomimicSource(Source):
                 f"`python -m palm_jax data repair {self.path} --out NEW`"
             ) from error
         return values
+
+    def read_through(self, dataset: h5py.Dataset) -> None:
+        """Reads an array in blocks.
+
+        Raises:
+          TruncatedError: it cannot be read.
+        """
+        if not dataset.shape:
+            self._read(dataset, ())
+            return
+        for first in range(0, len(dataset), _ROWS):
+            self._read(dataset, slice(first, first + _ROWS))
+
+    def read_masks(self) -> None:
+        """Reads the filter keys.
+
+        Raises:
+          TruncatedError: one cannot be read.
+        """
+        for item in (self.file.get("mask") or {}).values():
+            self.read_through(item)
 
     def blocks(self, episode: str, key: str, size: int) -> Iterator[np.ndarray]:
         dataset = self._dataset(episode, key)

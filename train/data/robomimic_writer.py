@@ -48,11 +48,11 @@ def checksum(dataset: h5py.Dataset) -> str:
 def sound(demo: h5py.Group) -> list[str]:
     """Problems of an episode against its checksums; empty if it has none of either."""
     try:
-        expected = dict(json.loads(demo.attrs.get(CHECKSUMS, "{}")))
-    except (ValueError, TypeError):
+        expected = json.loads(demo.attrs.get(CHECKSUMS, "{}")).items()
+    except (ValueError, TypeError, AttributeError):
         return [f"the attribute {CHECKSUMS} cannot be read"]
     problems = []
-    for key, value in expected.items():
+    for key, value in expected:
         if not isinstance(demo.get(key), h5py.Dataset):
             problems.append(f"{key} is missing")
             continue

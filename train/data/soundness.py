@@ -14,7 +14,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from palm_jax.train.data import output, robomimic_writer, video
+from palm_jax.train.data import lerobot_writer, output, robomimic_writer, video
 from palm_jax.train.data.calibration import RobotKeys
 from palm_jax.train.data.errors import (
     DataError,
@@ -23,7 +23,6 @@ from palm_jax.train.data.errors import (
     TruncatedError,
 )
 from palm_jax.train.data.lerobot import LeRobotSource
-from palm_jax.train.data.lerobot_writer import LeRobotWriter
 from palm_jax.train.data.recording import robot_keys
 from palm_jax.train.data.robomimic import RobomimicSource, by_number
 from palm_jax.train.data.source import Source, fingerprint, open_source
@@ -37,8 +36,9 @@ _PER_FRAME = ("actions", "states", "rewards", "dones")
 def verify(path: Path, *, robot: RobotKeys | None = None) -> Problems:
     """Reads everything and reports what is wrong; empty if the file is sound.
 
-    Lengths, totals, finite poses and actions, images that can be decoded or counted, and the
-    checksums of what `data align` has written.
+    Lengths, totals, finite poses and actions, every array and column that it can be read, images
+    that they can be decoded (in videos: that they are there), and the checksums of what `data
+    align` has written.
 
     Args:
       path: file or folder.
@@ -87,6 +87,8 @@ def _episode(source: Source, name: str, keys: list[str]) -> list[str]:
                 problems.append(f"{key} has {count} images, expected {length}")
         if isinstance(source, RobomimicSource):
             problems += _hdf5_episode(source, name, length)
+        if isinstance(source, LeRobotSource):
+            _read_columns(source, name)
     except (DataError, OSError, RuntimeError, KeyError, ValueError) as error:
         problems.append(str(error).removeprefix(f"{source.path}: "))
     return problems
@@ -106,14 +108,22 @@ def _hdf5_episode(source: RobomimicSource, name: str, length: int) -> list[str]:
     told = demo.attrs.get("num_samples")
     if told is None or int(told) != length:
         problems.append(f"num_samples is {told}, expected {length}")
-    for key, dataset in source.datasets(name):
-        if not key.startswith("obs/") and key not in _PER_FRAME:
-            continue
-        if len(dataset) != length:
-            problems.append(f"{key} has {len(dataset)} rows, expected {length}")
-        elif dataset.dtype.kind != "u":
-            source.numbers(name, key)  # raises where it cannot be read
+    for key, dataset in source.datasets(name, every=True):
+        per_frame = key.startswith("obs/") or key in _PER_FRAME
+        if per_frame and dataset.dtype.kind in "biuf" and dataset.shape:
+            if len(dataset) != length:
+                problems.append(f"{key} has {len(dataset)} rows, expected {length}")
+                continue
+        if key not in source.image_keys:
+            source.read_through(dataset)
     return problems + robomimic_writer.sound(demo)
+
+
+def _read_columns(source: LeRobotSource, name: str) -> None:
+    """Raises where a column that holds no images cannot be read."""
+    for key, entry in source.info["features"].items():
+        if key not in source.image_keys and entry["dtype"] != "video":
+            source.column(name, key)
 
 
 def _totals(source: Source) -> list[str]:
@@ -121,10 +131,15 @@ def _totals(source: Source) -> list[str]:
         frames = sum(source.length(name) for name in source.episodes)
     except DataError:
         return []  # told of the episode
+    problems: list[str] = []
     if isinstance(source, RobomimicSource):
         total = source.data.attrs.get("total")
-        return [] if total is None or int(total) == frames else [f"total is {total}, not {frames}"]
-    problems = []
+        if total is not None and int(total) != frames:
+            problems.append(f"total is {total}, not {frames}")
+        try:
+            source.read_masks()
+        except DataError as error:
+            problems.append(str(error).removeprefix(f"{source.path}: "))
     if isinstance(source, LeRobotSource):
         expected = {"total_episodes": len(source.episodes), "total_frames": frames}
         for key, value in expected.items():
@@ -136,6 +151,7 @@ def _totals(source: Source) -> list[str]:
             if begin != ends:
                 problems.append(f"episode {name} begins at {begin}, expected {ends}")
             ends = source.row(name)["dataset_to_index"]
+        problems += lerobot_writer.sound(source)
     return problems
 
 
@@ -326,7 +342,7 @@ def _renamed_masks(old: h5py.File, new: h5py.File, numbers: Mapping[str, str]) -
 def _copy_lerobot(source: Source, kept: list[str], partial: output.Partial) -> Path:
     if not isinstance(source, LeRobotSource):
         raise FormatError(f"{source.path}: nothing known to repair")
-    with LeRobotWriter(
+    with lerobot_writer.LeRobotWriter(
         partial, source, keep="all", encoding="png", prefix="palm", instead=False, episodes=kept
     ) as writer:
         for name in kept[len(writer.done) :]:
