@@ -4,13 +4,17 @@ At once means by the system's own action, also while a program is being compiled
 every file is written whole or not at all, so nothing has to be tidied up for that.
 """
 
+import _thread
 import os
 import signal
+import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_MOMENT = 0.05  # seconds
 
 
 class Stop:
@@ -43,8 +47,37 @@ def raising() -> Iterator[None]:
     def interrupt() -> None:
         raise KeyboardInterrupt
 
-    with _on_first_signal(interrupt):
+    with _on_first_signal(interrupt), _raised_again():
         yield
+
+
+@contextmanager
+def _raised_again() -> Iterator[None]:
+    """While an interrupt that Python has dropped is raised once more, a moment later.
+
+    A handler runs wherever the program is. In a finaliser, or in the callback of a weak reference,
+    as h5py and JAX have them by the thousand, what it raises is printed and forgotten.
+    """
+    before, handler = sys.unraisablehook, signal.getsignal(signal.SIGINT)
+    over = threading.Event()
+
+    def again() -> None:
+        if not over.wait(_MOMENT):
+            _thread.interrupt_main()
+
+    def hook(dropped: "sys.UnraisableHookArgs") -> None:
+        if not issubclass(dropped.exc_type, KeyboardInterrupt):
+            before(dropped)
+            return
+        signal.signal(signal.SIGINT, handler)
+        _thread.start_new_thread(again, ())  # Thread.start would wait, and be interrupted itself
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        over.set()
+        sys.unraisablehook = before
 
 
 @contextmanager

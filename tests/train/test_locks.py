@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import threading
+import time
+import weakref
 from pathlib import Path
 
 import pytest
@@ -174,3 +176,37 @@ def test_a_signal_is_noted_and_the_next_is_deadly() -> None:
     with pytest.raises(KeyboardInterrupt), interrupts.raising():
         os.kill(os.getpid(), signal.SIGTERM)
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+class Thing:
+    """To be referred to weakly."""
+
+
+def test_an_interrupt_in_a_callback_is_not_lost() -> None:
+    """Python drops what is raised there."""
+    before, called = sys.unraisablehook, []
+
+    def interrupt(reference: object) -> None:
+        called.append(reference)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0)  # the handler runs here at the latest
+
+    thing = Thing()
+    reference = weakref.ref(thing, interrupt)
+    with pytest.raises(KeyboardInterrupt), interrupts.raising():
+        del thing
+        assert called == [reference]
+        for _ in range(500):
+            time.sleep(0.01)
+        pytest.fail("the interrupt is lost")
+    assert sys.unraisablehook is before
+
+
+def test_other_exceptions_in_callbacks_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda dropped: told.append(dropped.exc_type))
+    thing = Thing()
+    reference = weakref.ref(thing, lambda reference: 1 / 0)
+    with interrupts.raising():
+        del thing
+    assert told == [ZeroDivisionError] and reference() is None
