@@ -85,9 +85,8 @@ def _raised_again(repeat: Callable[[], None]) -> Iterator[None]:
 
     def hook(dropped: "sys.UnraisableHookArgs") -> None:
         if issubclass(dropped.exc_type, Signalled):
-            _thread.start_new_thread(
-                again, ()
-            )  # Thread.start would wait, and be interrupted itself
+            # Thread.start would wait, and be interrupted itself.
+            _thread.start_new_thread(again, ())
         else:
             before(dropped)
 
