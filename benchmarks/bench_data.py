@@ -5,10 +5,10 @@ frames read and decompressed, aligned, compressed (gzip, level 1), checksummed a
 disk. The look for flipped images is left out: it takes the same seconds whatever the size of the
 file. The files are in the system's cache when they are read.
 
-`layouts`: for HDF5 the images as they are (raw), or a frame a chunk compressed by gzip or lzf; raw
-with lens coefficients, so that frames are undistorted first; an mp4 (H.264) of a LeRobot set, where
-PyAV and pyarrow are installed. `peak_mb` is the memory of the
-process.
+`layouts`: for HDF5 the images as they are (raw), or a frame a chunk compressed by gzip or lzf, or
+gzip with h5py's own chunks, which cut frames into pieces; raw with lens coefficients, so that
+frames are undistorted first; an mp4 (H.264) of a LeRobot set, where PyAV and pyarrow are installed.
+`peak_mb` is the memory of the process.
 """
 
 import importlib.util
@@ -24,6 +24,7 @@ import h5py
 import numpy as np
 
 from palm_jax.train import data
+from palm_jax.train.data import output
 from palm_jax.train.data.lerobot_writer import LeRobotWriter
 from palm_jax.train.data.source import Source
 
@@ -31,6 +32,7 @@ EPISODES, LENGTH, FRAME, DISTINCT = 4, 256, 512, 32
 LAYOUTS: dict[str, dict[str, Any]] = {
     "raw": {},
     "gzip": {"compression": "gzip", "chunks": (1, FRAME, FRAME, 3)},
+    "pieces": {"compression": "gzip"},  # h5py's own chunks, as robomimic's --compress has them
     "lzf": {"compression": "lzf", "chunks": (1, FRAME, FRAME, 3)},
 }
 FOVY = 45.0
@@ -131,15 +133,17 @@ def record(path: Path, layout: str) -> None:
 def _as_video(path: Path, folder: Path) -> Path:
     """The same recording as a LeRobot set with one mp4 an episode."""
     with data.open_source(path) as source:
-        writer = LeRobotWriter(
-            folder, source, {}, keep="numbers", encoding="h264", prefix="front", instead=False
-        )
-        for name in source.episodes:
-            writer.begin(name, LENGTH, {})
-            for block in _blocks(source, name):
-                writer.add(block, {})
-            writer.end()
-        writer.complete()
+        with output.begun(folder, {}) as partial:
+            with LeRobotWriter(
+                partial, source, keep="numbers", encoding="h264", prefix="front", instead=False
+            ) as writer:
+                for name in source.episodes:
+                    writer.begin(name, LENGTH, {})
+                    for block in _blocks(source, name):
+                        writer.add(block, {})
+                    writer.end()
+                content = writer.complete()
+            partial.publish(content)
     path.unlink()
     return folder
 

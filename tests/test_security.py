@@ -4,6 +4,7 @@ import ast
 import html.parser
 import io
 import json
+import os
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator
@@ -13,14 +14,17 @@ from typing import Any
 import datasets
 import h5py
 import numpy as np
-import pyarrow
-import pyarrow.parquet
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from PIL import EpsImagePlugin, Image
 
+from palm_jax.__main__ import main
 from palm_jax.train import checkpoint, demos, pictures, records, report, table_page, torch_files
+from palm_jax.train import data as recordings
 from palm_jax.train.checkpoint import DamagedCheckpoint
-from palm_jax.train.data.errors import TruncatedError
+from palm_jax.train.data.errors import FormatError, TruncatedError
+from palm_jax.train.data.importers import from_maniskill
 from palm_jax.train.data.source import open_source
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -173,12 +177,12 @@ def test_images_in_a_table_are_of_known_kinds(tmp_path: Path, ghostscript: list[
     """Those of a LeRobot data set: PNG or JPEG inside as a rule, PostScript never."""
     root = datasets.lerobot(tmp_path)
     table = root / "data/chunk-000/file-000.parquet"
-    columns = pyarrow.parquet.read_table(table)
+    columns = pq.read_table(table)
     shown = io.BytesIO()
     Image.fromarray(datasets.frames(datasets.LIFT)[0]).save(shown, format="PNG")
     contents = [shown.getvalue(), *[postscript()] * (len(columns) - 1)]
-    images = pyarrow.array([{"bytes": content, "path": None} for content in contents])
-    pyarrow.parquet.write_table(columns.append_column("observation.images.side", images), table)
+    images = pa.array([{"bytes": content, "path": None} for content in contents])
+    pq.write_table(columns.append_column("observation.images.side", images), table)
     info = json.loads((root / "meta/info.json").read_text())
     info["features"]["observation.images.side"] = {"dtype": "image", "shape": [3, 128, 128]}
     (root / "meta/info.json").write_text(json.dumps(info))
@@ -260,25 +264,258 @@ def test_meta_data_are_not_written_through_a_link(saved: Path, tmp_path: Path) -
 # --------------------------------------------------------------------------------- demonstrations
 
 
-@pytest.mark.parametrize("kind", ["external link", "soft link", "virtual array", "outside array"])
+WAYS_OUT = ["external link", "soft link", "virtual array", "outside array"]
+SECRET = np.arange(15.0)
+
+
+def lead_out(group: h5py.Group, name: str, kind: str, folder: Path) -> None:
+    """Puts an array into a group that is not there."""
+    with h5py.File(folder / "other.hdf5", "w") as other:
+        other["x"] = SECRET
+    (folder / "raw").write_bytes(SECRET.tobytes())
+    if kind == "external link":
+        group[name] = h5py.ExternalLink(str(folder / "other.hdf5"), "/x")
+    elif kind == "soft link":
+        group[name] = h5py.SoftLink("/data")
+    elif kind == "virtual array":
+        layout = h5py.VirtualLayout(SECRET.shape, "f8")
+        layout[:] = h5py.VirtualSource(folder / "other.hdf5", "x", SECRET.shape)
+        group.create_virtual_dataset(name, layout)
+    else:
+        where = [(str(folder / "raw"), 0, SECRET.nbytes)]
+        group.create_dataset(name, SECRET.shape, "f8", external=where)
+
+
+@pytest.mark.parametrize("kind", WAYS_OUT)
 def test_demonstrations_lie_in_their_own_file(kind: str, tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "other.hdf5", "w") as other:
-        other["x"] = np.zeros(4)
     with h5py.File(tmp_path / "demos.hdf5", "w") as file:
-        group = file.create_group("data/demo_0")
-        if kind == "external link":
-            group["actions"] = h5py.ExternalLink(str(tmp_path / "other.hdf5"), "/x")
-        elif kind == "soft link":
-            group["actions"] = h5py.SoftLink("/data")
-        elif kind == "virtual array":
-            layout = h5py.VirtualLayout((4,), "f8")
-            layout[:] = h5py.VirtualSource(tmp_path / "other.hdf5", "x", (4,))
-            group.create_virtual_dataset("actions", layout)
-        else:
-            where = [(str(tmp_path / "raw"), 0, 32)]
-            group.create_dataset("actions", (4,), "f8", external=where)
+        lead_out(file.create_group("data/demo_0"), "actions", kind, tmp_path)
     with pytest.raises(demos.DemoFileError, match="actions (is a link|lies in another file)"):
         demos.load(tmp_path / "demos.hdf5", task="lift_lid", robot="panda")
+
+
+# ------------------------------------------------------------------------- recordings of others
+
+
+@pytest.mark.parametrize("kind", WAYS_OUT)
+@pytest.mark.parametrize("place", ["data/demo_1/obs", "mask"])
+def test_recordings_lie_in_their_own_file(kind: str, place: str, tmp_path: Path) -> None:
+    """Nothing of another file is read, nor copied into what `repair` writes."""
+
+    def lead(file: h5py.File) -> None:
+        lead_out(file.require_group(place), "leak", kind, tmp_path)
+
+    path, out = datasets.changed(datasets.LIFT, tmp_path, lead), tmp_path / "out.hdf5"
+    words = r"leak (is a link|lies in another file).*expand_external"
+    with pytest.raises(FormatError, match=words), recordings.open_source(path) as source:
+        source.numbers("demo_1", "obs/leak")
+    if place == "mask":
+        return
+    assert "leak" in recordings.verify(path)["demo_1"][0]
+    assert list(recordings.repair(path, out).dropped) == ["demo_1"]
+    with h5py.File(out) as file:
+        file.visititems(lambda name, item: pytest.fail(name) if "leak" in name else None)
+
+
+@pytest.mark.parametrize("name", ["data", "mask", "data/demo_0"])
+def test_a_file_merged_by_links_is_refused(name: str, tmp_path: Path) -> None:
+    """Images that lie one after the other are read past HDF5: from this very file."""
+    with h5py.File(datasets.LIFT) as old, h5py.File(tmp_path / "other.hdf5", "w") as new:
+        old.copy("data", new)
+        new["mask/train"] = np.array([b"demo_0"])
+        for demo in new["data"].values():
+            datasets.replace(demo, datasets.IMAGES, demo[datasets.IMAGES][()])
+    with h5py.File(tmp_path / "merged.hdf5", "w") as merged:
+        merged["pad"] = np.zeros(10_000_000, np.uint8)  # longer than what the links lead to
+        for link in {"mask": ["data/demo_0", "mask"]}.get(name, [name]):
+            if link == "data/demo_0" and name == "mask":
+                with h5py.File(tmp_path / "other.hdf5") as other:
+                    other.copy("data", merged)
+                continue
+            merged[link] = h5py.ExternalLink(str(tmp_path / "other.hdf5"), link)
+    with pytest.raises(FormatError, match=f"{name} is a link"):
+        with recordings.open_source(tmp_path / "merged.hdf5") as source:
+            list(source.blocks("demo_0", datasets.IMAGES, 8))
+
+
+def test_filter_keys_beyond_the_end_are_no_reason_to_refuse(tmp_path: Path) -> None:
+    path = tmp_path / "cut.hdf5"
+    shutil.copyfile(datasets.LIFT, path)
+    before = path.stat().st_size
+    with h5py.File(path, "r+") as file:
+        file["mask/train"] = np.array([b"demo_0"])
+    for number, size in enumerate(range(path.stat().st_size - 200, before - 1, -200)):
+        os.truncate(path, size)
+        saved = recordings.repair(path, tmp_path / f"{number}.hdf5")
+        assert saved.kept == ("demo_0", "demo_1")
+
+
+@pytest.mark.parametrize("kind", WAYS_OUT)
+def test_camera_poses_lie_in_their_own_file(kind: str, tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "traj.hdf5", "w") as file:
+        group = file.create_group("traj_0/obs/sensor_param/front")
+        group["intrinsic_cv"] = np.eye(3)
+        lead_out(group, "extrinsic_cv", kind, tmp_path)
+    with pytest.raises(FormatError, match="extrinsic_cv (is a link|lies in another file)"):
+        from_maniskill(tmp_path / "traj.hdf5", None, [], (128, 128))
+
+
+FRONT = "observation.images.front"
+
+
+def renamed_feature(root: Path, name: str) -> None:
+    """A LeRobot set whose camera has another name; the video stays where it was."""
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"][name] = info["features"].pop(FRONT)
+    info["video_path"] = info["video_path"].format(
+        video_key=FRONT, chunk_index=0, file_index=0
+    )  # without fields: the same for all
+    (root / "meta/info.json").write_text(json.dumps(info))
+    table = root / "meta/episodes/chunk-000/file-000.parquet"
+    found = pq.read_table(table)
+    names = [column.replace(FRONT, name) for column in found.column_names]
+    pq.write_table(found.rename_columns(names), table)
+
+
+@pytest.mark.parametrize("name", ["../../../../outside/evil", "/etc/evil", "..", "a\\b", "", "\0"])
+def test_a_feature_names_no_file_elsewhere(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = datasets.lerobot(tmp_path)
+    renamed_feature(root, name)
+    out = tmp_path / "deep" / "er" / "out"
+    out.parent.mkdir(parents=True)
+    before = sorted(tmp_path.rglob("*"))
+    assert main(["data", "repair", str(root), "--out", str(out)]) == 2
+    assert "error: FormatError: " in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_other_names_of_features_are_fine(tmp_path: Path) -> None:
+    root = datasets.lerobot(tmp_path)
+    renamed_feature(root, "observation.images.left (RGB)")
+    assert recordings.repair(root, tmp_path / "out").kept == ("0", "1")
+
+
+@pytest.mark.parametrize("way", ["absolute", "dots", "link", "linked folder", "circle", "no field"])
+@pytest.mark.parametrize("field", ["data_path", "video_path"])
+def test_a_data_set_names_no_file_elsewhere(way: str, field: str, tmp_path: Path) -> None:
+    (tmp_path / "here").mkdir(), (tmp_path / "there").mkdir()
+    root, other = datasets.lerobot(tmp_path / "here"), datasets.lerobot(tmp_path / "there")
+    kind = {"data_path": "*.parquet", "video_path": "*.mp4"}[field]
+    folder = field.partition("_")[0].replace("video", "videos")
+    file, foreign = next((root / folder).rglob(kind)), next((other / folder).rglob(kind))
+    names = {
+        "absolute": str(foreign.resolve()), "no field": "{other}",
+        "dots": f"../../there/set/{foreign.relative_to(other)}",
+    }  # fmt: skip
+    if way in names:
+        info = json.loads((root / "meta/info.json").read_text()) | {field: names[way]}
+        (root / "meta/info.json").write_text(json.dumps(info))
+    elif way == "linked folder":
+        shutil.rmtree(file.parent)
+        file.parent.symlink_to(foreign.parent.resolve())
+    else:
+        file.unlink()
+        file.symlink_to(file if way == "circle" else foreign.resolve())
+    with pytest.raises(FormatError, match="leads out of the data set|expected a path with"):
+        with recordings.open_source(root) as source:
+            source.numbers("0", "action")
+            list(source.blocks("0", FRONT, 8))
+
+
+def test_a_hash_covers_no_file_elsewhere(tmp_path: Path) -> None:
+    root = datasets.lerobot(tmp_path)
+    (tmp_path / "private").write_text("secret")
+    (root / "README.md").symlink_to(tmp_path / "private")
+    with recordings.open_source(root) as source:
+        with pytest.raises(FormatError, match="leads out of the data set.*cp -rL"):
+            source.fingerprint()
+
+
+def pictures_in_a_table(root: Path, item: dict[str, Any]) -> None:
+    """The camera's frames as pictures in the table, all the same."""
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"][FRONT]["dtype"] = "image"
+    (root / "meta/info.json").write_text(json.dumps(info))
+    file = root / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(file)
+    pq.write_table(table.append_column(FRONT, pa.array([item] * len(table))), file)
+
+
+def test_pictures_in_tables_lie_in_the_folder_and_run_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        EpsImagePlugin, "Ghostscript", lambda *args, **options: pytest.fail("Ghostscript is run")
+    )
+    content = io.BytesIO()
+    Image.new("RGB", (128, 128)).save(content, "EPS")
+    Image.new("RGB", (128, 128)).save(tmp_path / "private.png")
+    for number, (item, words) in enumerate(
+        [
+            ({"bytes": None, "path": "../../private.png"}, "leads out of the data set"),
+            ({"bytes": None, "path": str(tmp_path / "private.png")}, "leads out of the data set"),
+            ({"bytes": content.getvalue(), "path": ""}, "an image that cannot be read"),
+        ]
+    ):
+        (tmp_path / str(number)).mkdir()
+        root = datasets.lerobot(tmp_path / str(number))
+        pictures_in_a_table(root, item)
+        with recordings.open_source(root) as source:
+            with pytest.raises((FormatError, TruncatedError), match=words):
+                source.image("0", FRONT, 1)
+
+
+@pytest.mark.parametrize("function", ["blocks", "verify"])
+def test_a_list_of_files_is_no_video(function: str, tmp_path: Path) -> None:
+    """FFmpeg reads a list of videos as one video."""
+    root = datasets.lerobot(tmp_path)
+    video = next(root.rglob("*.mp4"))
+    video.rename(video.with_name("private.mp4"))
+    video.write_text("ffconcat version 1.0\nfile 'private.mp4'\n")
+    if function == "verify":
+        assert "not a readable video" in recordings.verify(root)["0"][0]
+        return
+    with recordings.open_source(root) as source:
+        with pytest.raises(FormatError, match="not a readable video"):
+            list(source.blocks("0", FRONT, 8))
+
+
+def test_a_name_that_ffmpeg_takes_for_an_address_is_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = datasets.lerobot(tmp_path)
+    video = next(root.rglob("*.mp4"))
+    video.rename(root / "concat:private.mp4")
+    info = json.loads((root / "meta/info.json").read_text())
+    info["video_path"] = "concat:private.mp4"
+    (root / "meta/info.json").write_text(json.dumps(info))
+    monkeypatch.chdir(root)
+    with recordings.open_source(Path(".")) as source:
+        assert len(np.concatenate(list(source.blocks("0", FRONT, 8)))) == 15
+
+
+def test_a_camera_names_no_file_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    content = datasets.robosuite(datasets.CAN).to_json()
+    camera = content["cameras"].pop("agentview")
+    camera["image"] = datasets.IMAGES
+    content["cameras"]["x/../../escaped/evil"] = camera
+    work = tmp_path / "a" / "b"
+    work.mkdir(parents=True)
+    (tmp_path / "calibration.json").write_text(json.dumps(content))
+    monkeypatch.chdir(work)
+    words = [
+        "data",
+        "check",
+        os.path.abspath(datasets.CAN),
+        "--calibration",
+        "../../calibration.json",
+    ]
+    assert main(words) == 0
+    assert [str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*.png")] == [
+        "a/b/robosuite_can-x-escaped-evil.png"
+    ]
 
 
 # ------------------------------------------------------------------------------------------ pages

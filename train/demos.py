@@ -26,6 +26,7 @@ from palm_jax.align import AlignSpec, Camera
 from palm_jax.envs.base import PAPER_FRAME, Env, EnvParams, State
 from palm_jax.envs.expert import Demonstrator, Recording
 from palm_jax.envs.rollout import Runner, repeat_params, take_params
+from palm_jax.train import hdf5_files
 from palm_jax.train.metrics import write_atomic
 
 FORMAT = "palm_jax-demos"
@@ -222,7 +223,8 @@ def load(path: Path, *, task: str, robot: str, count: int | None = None) -> Demo
     """
     try:
         with h5py.File(path, "r") as file:
-            _refuse_ways_out(file, path)
+            if wrong := hdf5_files.way_out(file):
+                raise DemoFileError(f"{path}: {wrong}")
             return _read(file["data"], path, task, robot, count)
     except DemoFileError:
         raise
@@ -230,22 +232,6 @@ def load(path: Path, *, task: str, robot: str, count: int | None = None) -> Demo
         raise DemoFileError(
             f"{path} is not a whole demonstration file ({error}); move it away and collect again"
         ) from error
-
-
-def _refuse_ways_out(file: h5py.File, path: Path) -> None:
-    """HDF5 can refer to other files, by links and as storage of its arrays: ours never do."""
-
-    def look(name: str, link: Any) -> str | None:
-        if not isinstance(link, h5py.HardLink):
-            return f"{name} is a link; expected the data themselves"
-        found = file[name]
-        if isinstance(found, h5py.Dataset) and (found.external or found.is_virtual):
-            return f"{name} lies in another file; expected it in this one"
-        return None
-
-    # The first that is wrong ends the visit; h5py passes no exception on.
-    if wrong := file.visititems_links(look):
-        raise DemoFileError(f"{path}: {wrong}")
 
 
 def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None) -> Demos:

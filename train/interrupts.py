@@ -7,6 +7,7 @@ ends the process at the second. Every file is written whole or not at all, so no
 tidied up for that. Only code that holds the interpreter's lock throughout delays it.
 """
 
+import _thread
 import contextlib
 import os
 import signal
@@ -17,6 +18,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_MOMENT = 0.05  # seconds
 
 SAME = 0.2
 """Seconds in which signals are one request: timeout(1) and some wrappers send each of them twice,
@@ -63,8 +65,37 @@ def raising() -> Iterator[None]:
     def interrupt() -> None:
         raise Signalled
 
-    with _watching(interrupt, "Stopping; once more ends at once.", _nothing):
+    with _watching(interrupt, "Stopping; once more ends at once.", _nothing) as repeat:
+        with _raised_again(repeat):
+            yield
+
+
+@contextlib.contextmanager
+def _raised_again(repeat: Callable[[], None]) -> Iterator[None]:
+    """While an interrupt that Python has dropped is raised once more, a moment later.
+
+    A handler runs wherever the program is. In a finaliser, or in the callback of a weak reference,
+    as h5py and JAX have them by the thousand, what it raises is printed and forgotten.
+    """
+    before, over = sys.unraisablehook, threading.Event()
+
+    def again() -> None:
+        if not over.wait(_MOMENT):
+            repeat()
+
+    def hook(dropped: "sys.UnraisableHookArgs") -> None:
+        if issubclass(dropped.exc_type, Signalled):
+            # Thread.start would wait, and be interrupted itself.
+            _thread.start_new_thread(again, ())
+        else:
+            before(dropped)
+
+    sys.unraisablehook = hook
+    try:
         yield
+    finally:
+        over.set()
+        sys.unraisablehook = before
 
 
 def leave(stop: KeyboardInterrupt) -> int:
@@ -86,9 +117,16 @@ def end(status: int) -> NoReturn:
 
 
 @contextlib.contextmanager
-def _watching(act: Callable[[], None], promise: str, at_once: Callable[[], None]) -> Iterator[None]:
-    """In the main thread: `act` runs there, at the first signal, as soon as Python does."""
+def _watching(
+    act: Callable[[], None], promise: str, at_once: Callable[[], None]
+) -> Iterator[Callable[[], None]]:
+    """In the main thread: `act` runs there, at the first signal, as soon as Python does.
+
+    Yields:
+      what makes `act` run there once more, called in any thread.
+    """
     acted = False
+    repeats: list[int] = []
 
     def handle(number: int, frame: Any) -> None:
         nonlocal acted
@@ -96,14 +134,20 @@ def _watching(act: Callable[[], None], promise: str, at_once: Callable[[], None]
             acted = True
             act()
 
+    def repeat() -> None:
+        nonlocal acted
+        acted = False
+        repeats.append(signal.SIGINT)  # first: the watcher is told of this one, too
+        _thread.interrupt_main()
+
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
-    watcher = threading.Thread(target=_watch, args=(reader, promise, at_once), daemon=True)
+    watcher = threading.Thread(target=_watch, args=(reader, promise, at_once, repeats), daemon=True)
     watcher.start()
     before = {number: signal.signal(number, handle) for number in SIGNALS}
     outer = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     try:
-        yield
+        yield repeat
     finally:
         signal.set_wakeup_fd(outer)
         for number, handler in before.items():
@@ -113,11 +157,15 @@ def _watching(act: Callable[[], None], promise: str, at_once: Callable[[], None]
         os.close(reader)
 
 
-def _watch(reader: int, promise: str, at_once: Callable[[], None]) -> None:
+def _watch(reader: int, promise: str, at_once: Callable[[], None], repeats: list[int]) -> None:
+    """`repeats`: signals that are to come and are no requests."""
     first: float | None = None
     while numbers := os.read(reader, 64):
         for number in numbers:
             if number not in SIGNALS:
+                continue
+            if number in repeats:
+                repeats.remove(number)
                 continue
             if first is None:
                 first = time.monotonic()

@@ -9,6 +9,9 @@ it held before, for Slurm ended that; anything else has to be given up by a pers
 
 `locked` is an advisory lock (flock) beside a file, for reading, changing and writing it. The kernel
 frees it with the process that held it. Claims are made and taken over under such a lock, too.
+
+`alone` is the same in folders of the user's, where nothing may be left: it does not wait, and its
+file is gone afterwards.
 """
 
 import contextlib
@@ -21,7 +24,7 @@ import os
 import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 from palm_jax.train.metrics import write_atomic
 
@@ -215,12 +218,50 @@ def locked(path: str | Path, *, waiting: Callable[[], None] | None = None) -> It
     with path.with_name(f".{path.name.lstrip('.')}.lock").open("a") as file:
         if waiting is None:
             fcntl.flock(file, fcntl.LOCK_EX)
-        else:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                if error.errno not in (errno.EAGAIN, errno.EACCES):
-                    raise
-                waiting()
-                fcntl.flock(file, fcntl.LOCK_EX)
+        elif not _free(file):
+            waiting()
+            fcntl.flock(file, fcntl.LOCK_EX)
         yield
+
+
+def _free(file: IO[Any]) -> bool:
+    """Takes the lock on a file if no other has it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno not in (errno.EAGAIN, errno.EACCES):
+            raise
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def alone(path: str | Path) -> Iterator[None]:
+    """Holds a lock among all processes that ask the same way, without waiting for it.
+
+    Args:
+      path: of the lock, an empty file. One that a killed process has left holds nobody up.
+
+    Raises:
+      Busy: another process has it.
+    """
+    path = Path(path)
+    while True:
+        with path.open("a") as file:
+            if not _free(file):
+                raise Busy(f"another process holds {path}")
+            if not _is(path, file):
+                continue  # the one who held it has just deleted it
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)  # first: whoever has it open sees that it is gone
+            return
+
+
+def _is(path: Path, file: IO[Any]) -> bool:
+    """Whether an open file still is the one of that name."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import re
 import shutil
 from collections.abc import Callable, Iterator
@@ -18,8 +19,22 @@ from scipy.spatial.transform import Rotation
 from palm_jax.__main__ import main
 from palm_jax.align import AlignSpec
 from palm_jax.train import data
-from palm_jax.train.data import aligning, job, output, robomimic_writer, soundness
-from palm_jax.train.data.errors import CalibrationError, DataError, OutputError, TruncatedError
+from palm_jax.train.data import (
+    aligning,
+    commands,
+    job,
+    lerobot_writer,
+    output,
+    robomimic_writer,
+    soundness,
+)
+from palm_jax.train.data.errors import (
+    CalibrationError,
+    DataError,
+    EpisodeLengthError,
+    OutputError,
+    TruncatedError,
+)
 from palm_jax.train.data.job import Options
 from palm_jax.train.data.recording import Recording, open_recording
 
@@ -72,16 +87,18 @@ def poses(episode: str) -> np.ndarray:
         )
 
 
-def camera() -> tuple[np.ndarray, np.ndarray]:
+def camera(path: Path = datasets.LIFT, episode: str = "demo_0") -> tuple[np.ndarray, np.ndarray]:
     """K and pose that robosuite wrote."""
-    with h5py.File(datasets.LIFT) as file:
-        info = json.loads(file["data/demo_0"].attrs["camera_info"])["agentview"]
+    with h5py.File(path) as file:
+        info = json.loads(file[f"data/{episode}"].attrs["camera_info"])["agentview"]
     return np.array(info["intrinsics"]), np.array(info["extrinsics"])
 
 
-def expected_image(image: np.ndarray, tcp: np.ndarray) -> np.ndarray:
+def expected_image(
+    image: np.ndarray, tcp: np.ndarray, seen_by: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
     """Overlay, crop and resize one after the other, slowly."""
-    K, pose = camera()
+    K, pose = seen_by
     drawn = oracles.draw_overlay(
         image, K, pose, tcp, SPEC.axis_length, int(SPEC.thickness), SPEC.arrow_length,
         SPEC.arrow_width, int(SPEC.dot_radius),
@@ -103,7 +120,7 @@ def test_against_slow_references(aligned: Path, episode: str) -> None:
     assert got["obs/palm_valid"].all()
     _, pose = camera()
     for frame in range(0, len(tcp), 5):
-        image = expected_image(images[frame], tcp[frame])
+        image = expected_image(images[frame], tcp[frame], camera())
         # Truncated, and line rasterisers differ: see the tolerances of the overlay.
         assert np.abs(got["obs/palm_image"][frame] - image).mean() < 3
         sixd = oracles.rotation_6d(pose[:3, :3].T @ tcp[frame, :3, :3])
@@ -202,14 +219,57 @@ def test_a_camera_that_moved_between_episodes(tmp_path: Path) -> None:
     def move(file: h5py.File) -> None:
         attributes = file["data/demo_1"].attrs
         info = json.loads(attributes["camera_info"])
-        info["agentview"]["extrinsics"][2][3] += 0.1
+        turn = oracles.pose(Rotation.from_euler("y", 4, degrees=True).as_matrix(), [0, 0, 0.1])
+        pose = np.array(info["agentview"]["extrinsics"]) @ turn
+        info["agentview"]["extrinsics"] = pose.tolist()
         attributes["camera_info"] = json.dumps(info)
 
     path = datasets.changed(datasets.LIFT, tmp_path, move)
     with open_recording(path, datasets.robosuite(path)) as recording:
-        found = {e.name: e for e in data.aligned_episodes(recording, SPEC)}
-    heights = [e.camera.cam_to_world[2, 3] for e in found.values()]
-    assert heights[1] - heights[0] == pytest.approx(0.1, abs=1e-6)
+        found = list(data.aligned_episodes(recording, SPEC))
+    for episode in found:
+        own, tcp = camera(path, episode.name), poses(episode.name)
+        images = datasets.frames(path, episode.name)
+        np.testing.assert_allclose(episode.camera.cam_to_world, own[1], atol=1e-6)
+        for frame in range(0, len(tcp), 5):
+            sixd = oracles.rotation_6d(own[1][:3, :3].T @ tcp[frame, :3, :3])
+            np.testing.assert_allclose(episode.proprio[frame, :6], sixd, atol=1e-5)
+            image = expected_image(images[frame], tcp[frame], own)
+            assert np.abs(episode.images[frame] - image).mean() < 3
+    assert [episode.name for episode in found] == ["demo_0", "demo_1"]
+
+
+def test_one_of_many_episodes_has_no_images(tmp_path: Path) -> None:
+    """It is neither skipped nor are the others written without it."""
+
+    def empty(file: h5py.File) -> None:
+        for number in range(2, 12):
+            file.copy(f"data/demo_{number % 2}", f"data/demo_{number}")
+        demo = file["data/demo_2"]
+        datasets.replace(demo, datasets.IMAGES, demo[datasets.IMAGES][:0])
+
+    (tmp_path / "source").mkdir(), (tmp_path / "out").mkdir()
+    path = datasets.changed(datasets.LIFT, tmp_path / "source", empty)
+    for trust in (False, True):
+        with open_recording(path, datasets.robosuite()) as recording:
+            with pytest.raises(EpisodeLengthError, match="demo_2 has 15 poses and 0 images"):
+                data.align_file(recording, SPEC, tmp_path / "out" / "new", trust=trust)
+        assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_more_images_than_poses_where_a_block_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def add(file: h5py.File) -> None:
+        demo = file["data/demo_0"]
+        images = np.repeat(demo[datasets.IMAGES], 2, 0)[:20]
+        datasets.replace(demo, datasets.IMAGES, images)
+
+    monkeypatch.setattr(aligning, "BLOCK", 5)
+    path = datasets.changed(datasets.LIFT, tmp_path, add)
+    with open_recording(path, datasets.robosuite()) as recording:
+        with pytest.raises(EpisodeLengthError, match="15 poses and more images"):
+            list(data.aligned_episodes(recording, SPEC))
 
 
 def test_the_paper_scales_with_the_frame() -> None:
@@ -282,14 +342,99 @@ def test_keeping_nothing_with_filter_keys(tmp_path: Path) -> None:
         assert list(file["mask/train"][()]) == [b"demo_1"]
 
 
-def test_an_aligned_file_can_be_aligned_again(aligned: Path) -> None:
-    """Its poses are known; robomimic's readers and this one see the same keys."""
-    from palm_jax.train.data.recording import robot_keys
+AGAIN = dataclasses.replace(
+    datasets.robosuite(), robot=data.RobotKeys(pose="palm_tcp", opening="palm_opening")
+)
+"""For what has been aligned: its own poses."""
 
-    with data.open_source(aligned) as source:
-        assert source.image_keys == ["obs/palm_image"]
-        keys = robot_keys(source, data.RobotKeys(pose="palm_tcp", opening="palm_opening"))
-    assert (keys.rotation, keys.open) == ("matrix", 1.0)
+
+@pytest.mark.parametrize(
+    ("format", "keep"),
+    [("robomimic", "numbers"), ("robomimic", "all"), ("robomimic", "none"),
+     ("lerobot", "numbers"), ("lerobot", "none")],
+)  # fmt: skip
+def test_an_aligned_file_can_be_aligned_again(
+    format: str, keep: str, aligned: Path, tmp_path: Path
+) -> None:
+    """From its own poses, with the same result beside the first one."""
+    both, out = tmp_path / "both.hdf5", tmp_path / "out"
+    with open_recording(datasets.LIFT, datasets.robosuite()) as recording:
+        data.align_file(recording, SPEC, both, Options(keep="all"))
+    with open_recording(both, AGAIN, camera="agentview") as recording:
+        options = Options(format=format, keep=keep, prefix="palm" if keep == "none" else "second")
+        data.align_file(recording, SPEC, out, options)
+    first = arrays(aligned, "demo_1")
+    if format == "lerobot":
+        columns = table_of(out, "data/chunk-000/file-000.parquet")
+        for key in ["palm_actions"] * (keep != "none") + [f"action.{options.prefix}"]:
+            np.testing.assert_allclose(columns[key][15:], first["palm_actions"], atol=2e-6)
+        return
+    second = arrays(out, "demo_1")
+    assert len(second) == len(OURS) + {"none": 0, "numbers": 16, "all": 18}[keep]
+    for key in OURS:
+        kept = second[key.replace("palm", options.prefix)]
+        np.testing.assert_allclose(kept, first[key], atol=2e-6 if kept.dtype.kind == "f" else 1)
+        if keep == "all":
+            np.testing.assert_array_equal(second[key], first[key])
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "name"),
+    [
+        ({"keep": "all"}, {}, "obs/palm_proprio"),
+        ({"keep": "all"}, {"keep": "all"}, "obs/palm_image"),
+        ({"keep": "all", "instead": True}, {"prefix": "p", "instead": True}, "source_actions"),
+        ({"keep": "all", "prefix": "p"}, {"prefix": "p"}, "obs/p_proprio"),
+    ],
+)
+def test_names_that_would_be_there_twice(
+    first: dict, second: dict, name: str, lift: Recording, tmp_path: Path
+) -> None:
+    data.align_file(lift, SPEC, tmp_path / "first", Options(**first))
+    with open_recording(tmp_path / "first", datasets.robosuite(), camera="agentview") as recording:
+        with pytest.raises(OutputError, match=f"{name}.* would be in the output twice.*--prefix"):
+            data.align_file(recording, SPEC, tmp_path / "second", Options(**second))
+    assert [path.name for path in tmp_path.iterdir()] == ["first"]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "name"),
+    [
+        ({}, {}, "observation.palm_proprio"),
+        ({"encoding": "h264"}, {"keep": "all"}, "observation.images.palm"),
+        ({"instead": True}, {"prefix": "p", "instead": True}, "source_state"),
+    ],
+)
+def test_names_that_would_be_there_twice_in_a_set(
+    first: dict, second: dict, name: str, front: Path, tmp_path: Path
+) -> None:
+    calibration = datasets.lerobot_calibration()
+    with open_recording(front, calibration) as recording:
+        data.align_file(recording, SPEC, tmp_path / "first", Options(keep="all", **first))
+    if first.get("instead"):
+        calibration = datasets.lerobot_calibration(
+            pose="source_state[0:6]", opening="source_state[6]"
+        )
+    with open_recording(tmp_path / "first", calibration, camera="front") as recording:
+        with pytest.raises(OutputError, match=f"{name}.* would be in the output twice.*--prefix"):
+            data.align_file(recording, SPEC, tmp_path / "second", Options(**second))
+        # Of a video and a column with the same last word neither is lost.
+        made = Options(keep="all", prefix="second")
+        data.align_file(recording, SPEC, tmp_path / "second", made)
+    names = [
+        set(json.loads((tmp_path / step / "meta/info.json").read_text())["features"])
+        for step in ("first", "second")
+    ]
+    new = {f"observation.second_{key}" for key in ("proprio", "valid", "tcp", "opening")}
+    assert names[1] - names[0] == {"observation.images.second", "action.second"} | new
+    assert names[0] <= names[1]
+    assert data.verify(tmp_path / "second", robot=calibration.robot) == {}
+
+
+@pytest.mark.parametrize("prefix", ["../x", "a/b", "", "a.b"])
+def test_prefixes_are_words(prefix: str) -> None:
+    with pytest.raises(OutputError, match="prefix: expected letters"):
+        Options(prefix=prefix)
 
 
 # -- LeRobot ---------------------------------------------------------------------------------------
@@ -410,6 +555,152 @@ def test_from_lerobot_and_back(front: Path, aligned: Path, tmp_path: Path) -> No
     assert starts == [0.0, pytest.approx(0.75)]
 
 
+def changed_set(folder: Path, columns: dict[str, Any], features: dict[str, Any]) -> Path:
+    """The LeRobot set with columns put in, and declared."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    root = datasets.lerobot(folder)
+    file = root / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(file)
+    for name, values in columns.items():
+        if name in table.column_names:
+            table = table.drop_columns([name])
+        table = table.append_column(name, pa.array(values))
+    pq.write_table(table, file)
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"] |= features
+    (root / "meta/info.json").write_text(json.dumps(info))
+    return root
+
+
+def stored_like_the_front(root: Path, video: str) -> None:
+    """Says of a video where its episodes are."""
+    import pyarrow.parquet as pq
+
+    file = root / "meta/episodes/chunk-000/file-000.parquet"
+    table = pq.read_table(file)
+    for name in table.column_names:
+        if name.startswith("videos/observation.images.front/"):
+            own = name.replace("observation.images.front", video)
+            table = table.append_column(own, table[name])
+    pq.write_table(table, file)
+
+
+def with_stats(root: Path) -> None:
+    wrong = {"min": [-99.0] * 7, "max": [99.0] * 7, "mean": [None] * 7, "std": [0.0] * 7}
+    image = {"mean": [[[0.5]]] * 3, "count": [33]}
+    stats = {"observation.state": wrong | {"count": [33]}, "observation.images.front": image}
+    (root / "meta/stats.json").write_text(json.dumps(stats))
+
+
+@pytest.mark.parametrize("kept", [1, 2])
+def test_statistics_are_those_of_what_is_kept(kept: int, tmp_path: Path) -> None:
+    """Those of images, which nobody has looked at, are kept for as long as they are right."""
+    (tmp_path / "old").mkdir()
+    columns = table_of(datasets.lerobot(tmp_path / "old"), "data/chunk-000/file-000.parquet")
+    state = np.array(columns["observation.state"])
+    if kept == 1:
+        state[20, 3] = np.nan
+    root = changed_set(tmp_path, {"observation.state": state.astype(np.float32).tolist()}, {})
+    with_stats(root)
+    robot = datasets.lerobot_calibration().robot
+    assert len(data.repair(root, tmp_path / "new", robot=robot).kept) == kept
+    stats = json.loads((tmp_path / "new/meta/stats.json").read_text())
+    rows = state[:15] if kept == 1 else state
+    for name in ("min", "max", "mean", "std"):
+        expected = getattr(rows.astype(np.float32).astype(float), name)(0)
+        np.testing.assert_allclose(stats["observation.state"][name], expected, atol=1e-9)
+    assert stats["observation.state"]["count"] == [len(rows)]
+    assert ("observation.images.front" in stats) == (kept == 2)
+
+
+@pytest.mark.parametrize("command", ["align", "repair"])
+def test_tasks_and_times_of_every_frame_are_kept(command: str, tmp_path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    index, times = [1] * 8 + [0] * 7 + [2] * 18, [i / 20 + 0.003 for i in [*range(15), *range(18)]]
+    columns = {"task_index": index, "timestamp": np.array(times, np.float32)}
+    root = changed_set(tmp_path, columns, {})
+    words = ["place", "lift", "wave", "unused"]
+    pq.write_table(
+        pa.table({"task_index": [0, 1, 2, 3], "task": words}), root / "meta/tasks.parquet"
+    )
+    episodes = root / "meta/episodes/chunk-000/file-000.parquet"
+    rows = pq.read_table(episodes).to_pylist()
+    rows[0]["tasks"], rows[1]["tasks"] = ["lift", "place"], ["wave"]
+    pq.write_table(pa.Table.from_pylist(rows), episodes)
+    out = tmp_path / "out"
+    if command == "repair":
+        data.repair(root, out, robot=datasets.lerobot_calibration().robot)
+    else:
+        with open_recording(root, datasets.lerobot_calibration()) as recording:
+            data.align_file(recording, SPEC, out)
+    got = table_of(out, "data/chunk-000/file-000.parquet")
+    found = pq.read_table(out / "meta/tasks.parquet").to_pydict()
+    assert found == {"task_index": [0, 1, 2], "task": words[:3]}
+    assert got["task_index"] == index
+    np.testing.assert_array_equal(got["timestamp"], columns["timestamp"])
+    tasks = table_of(out, "meta/episodes/chunk-000/file-000.parquet")["tasks"]
+    assert tasks == [["lift", "place"], ["wave"]]
+
+
+def test_what_robomimic_cannot_hold_is_left_out_and_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    depth = {"dtype": "video", "shape": [128, 128, 3], "names": None}
+    features = {
+        "language_instruction": {"dtype": "string", "shape": [1], "names": None},
+        "observation.depth": depth | {"info": {"is_depth_map": True}},
+    }
+    root = changed_set(tmp_path, {"language_instruction": ["lift"] * 33}, features)
+    stored_like_the_front(root, "observation.depth")
+    path = data.save_calibration(datasets.lerobot_calibration(), tmp_path / "c.json")
+    words = ["align", root, "--calibration", path, "--out", tmp_path / "new.hdf5"]
+    assert commands.main([*map(str, words), "--format", "robomimic"]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "not kept: language_instruction (string, not numbers)" in told
+    assert "not kept: observation.depth (video, not numbers)" in told
+    found = arrays(tmp_path / "new.hdf5")
+    assert found["obs/state"].shape == (15, 7) and "obs/language_instruction" not in found
+    with open_recording(root, datasets.lerobot_calibration()) as recording:
+        data.align_file(recording, SPEC, tmp_path / "new")
+    kept = table_of(tmp_path / "new", "data/chunk-000/file-000.parquet")
+    assert kept["language_instruction"] == ["lift"] * 33
+
+
+def test_what_lerobot_cannot_hold_is_left_out_and_told(tmp_path: Path) -> None:
+    def add(file: h5py.File) -> None:
+        for number, demo in enumerate(file["data"].values()):
+            length = len(demo["actions"])
+            demo["camera_pose"] = np.eye(4)
+            demo["square"] = np.zeros((15, 3))  # by chance as many rows as the first has frames
+            demo["text"] = "lift"
+            demo["timestamp"] = np.arange(length)
+            demo["obs/note"] = np.array([b"x"] * length)
+            demo["obs/wide"] = np.zeros((length, 2 + number))
+            if number == 0:
+                demo["obs/first"] = np.zeros(length)
+            else:
+                demo["obs/second"] = np.zeros(length)
+            demo["obs/fine"] = np.arange(length)
+
+    path = datasets.changed(datasets.LIFT, tmp_path, add)
+    with open_recording(path, datasets.robosuite()) as recording:
+        result = data.align_file(recording, SPEC, tmp_path / "set", Options(format="lerobot"))
+    rows, same_kind = "no numbers with a row for each frame", "not the same in all episodes"
+    assert result.skipped == {
+        "camera_pose": rows, "square": rows, "text": rows, "obs/note": rows,
+        "obs/wide": same_kind, "obs/first": same_kind, "obs/second": same_kind,
+        "timestamp": "LeRobot has its own",
+    }  # fmt: skip
+    columns = table_of(tmp_path / "set", "data/chunk-000/file-000.parquet")
+    assert columns["observation.fine"] == [*range(15), *range(18)]
+    np.testing.assert_allclose(columns["timestamp"][:15], np.arange(15) * 0.15, atol=1e-6)
+    assert data.verify(tmp_path / "set") == {}
+
+
 # -- stopping and going on -------------------------------------------------------------------------
 
 
@@ -426,6 +717,10 @@ def same(first: Path, second: Path) -> None:
         assert set(one) == set(other)
         for key, value in one.items():
             np.testing.assert_array_equal(value, other[key], err_msg=key)
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 class Stop:
@@ -447,20 +742,19 @@ def test_stopped_and_resumed(format: str, after: int, tmp_path: Path) -> None:
     source, whole, stopped = datasets.LIFT, tmp_path / "whole", tmp_path / "stopped"
     before = datasets.digest(source)
 
-    def run(out: Path, **more: Any) -> job.Result:
+    def run(out: Path, spec: AlignSpec = SPEC, **more: Any) -> job.Result:
         with open_recording(source, datasets.robosuite()) as recording:
-            return data.align_file(recording, SPEC, out, options, **more)
+            return data.align_file(recording, spec, out, options, **more)
 
     run(whole)
     with pytest.raises(KeyboardInterrupt):
         run(stopped, progress=Stop(after))
     assert not stopped.exists() and output.partial_path(stopped).exists()
-    with (
-        open_recording(source, datasets.robosuite()) as recording,
-        pytest.raises(OutputError, match="begun with spec = .*delete it"),
-    ):
-        other = dataclasses.replace(SPEC, size=64)
-        data.align_file(recording, other, stopped, options)
+    if after:
+        left = contents(output.partial_path(stopped))
+        with pytest.raises(OutputError, match="begun with spec = .*delete it"):
+            run(stopped, spec=dataclasses.replace(SPEC, size=64))
+        assert contents(output.partial_path(stopped)) == left
     result = run(stopped)
     assert result.resumed == (1 if after else 0)
     same(whole, stopped)
@@ -468,21 +762,168 @@ def test_stopped_and_resumed(format: str, after: int, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
 
 
-@pytest.mark.parametrize("damage", ["cut", "episode"])
-def test_a_damaged_partial_is_made_again(damage: str, aligned: Path, tmp_path: Path) -> None:
+def damaged(partial: Path, damage: str) -> None:
+    """What a kill, or bits that flip, may leave of the first episode."""
+    if damage.startswith("hdf5"):
+        file = partial / "data.hdf5"
+        if damage == "hdf5 cut":
+            os.truncate(file, 20_000)
+            return
+        if damage == "hdf5 taken over":  # killed while it went on with an earlier file
+            file.rename(partial / "left.hdf5")
+            file.write_bytes(b"half")
+            return
+        with h5py.File(file, "r+") as content:
+            key = "obs/palm_proprio" if damage == "hdf5 new" else "obs/robot0_eef_pos"
+            content[f"data/demo_0/{key}"][3, 2] += 0.1
+        return
+    pattern = {"note": "*.json", "table": "*.parquet", "video": "*.mp4"}[damage.split()[0]]
+    (file,) = [f for f in partial.rglob(pattern) if f.name != output.RECIPE and "1" not in f.name]
+    if damage.endswith("gone"):
+        file.unlink()
+    elif damage.endswith("cut"):
+        os.truncate(file, file.stat().st_size // 2)
+    else:
+        content = bytearray(file.read_bytes())
+        content[len(content) // 2] ^= 1
+        file.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("damage", "resumed"),
+    [("hdf5 cut", 0), ("hdf5 new", 0), ("hdf5 kept", 0), ("hdf5 taken over", 1), ("note cut", 0),
+     ("note gone", 0), ("table cut", 0), ("table flipped", 0), ("video cut", 0), ("video gone", 0),
+     ("video flipped", 0)],
+)  # fmt: skip
+def test_a_damaged_partial_is_made_again(damage: str, resumed: int, tmp_path: Path) -> None:
     """Killed without a chance to close the file, or bits that flipped since."""
-    out = tmp_path / "out.hdf5"
-    partial = output.partial_path(out)
+    options = Options(
+        format="robomimic" if damage.startswith("hdf5") else "lerobot",
+        encoding="h264" if damage.startswith("video") else "png",
+    )
+    # Twice the same images: of 84 pixels x264 does not make twice the same bytes.
+    spec = dataclasses.replace(SPEC, size=128) if damage.startswith("video") else SPEC
+    whole, out = tmp_path / "whole", tmp_path / "out"
     with open_recording(datasets.LIFT, datasets.robosuite()) as recording:
+        data.align_file(recording, spec, whole, options)
         with pytest.raises(KeyboardInterrupt):
-            data.align_file(recording, SPEC, out, progress=Stop(20))
-        if damage == "cut":
-            partial.write_bytes(partial.read_bytes()[:20_000])
-        else:
-            with h5py.File(partial, "r+") as file:
-                file["data/demo_0/obs/palm_proprio"][3, 2] += 0.1
-        assert data.align_file(recording, SPEC, out).resumed == 0
-    same(aligned, out)
+            data.align_file(recording, spec, out, options, progress=Stop(20))
+        damaged(output.partial_path(out), damage)
+        assert data.align_file(recording, spec, out, options).resumed == resumed
+    same(whole, out)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
+
+
+@pytest.mark.parametrize("format", ["robomimic", "lerobot"])
+def test_one_process_writes_an_output(format: str, lift: Recording, tmp_path: Path) -> None:
+    """A second one is refused and changes nothing, whatever it wants to write."""
+    options, out, whole = Options(format=format), tmp_path / "out", tmp_path / "whole"
+    refused = []
+
+    def second(frames: int) -> None:
+        before = contents(output.partial_path(out))
+        for write in (
+            lambda: data.align_file(lift, SPEC, out, options, trust=True),
+            lambda: data.repair(datasets.LIFT, out),
+        ):
+            with pytest.raises(OutputError, match="another process is writing .*--out"):
+                write()
+            refused.append(frames)
+        assert contents(output.partial_path(out)) == before
+
+    data.align_file(lift, SPEC, whole, options)
+    with open_recording(datasets.LIFT, datasets.robosuite()) as recording:
+        data.align_file(recording, SPEC, out, options, progress=second)
+    assert len(refused) >= 4
+    same(whole, out)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
+
+
+@pytest.mark.parametrize("format", ["robomimic", "lerobot"])
+def test_an_output_that_appears_in_the_meantime(
+    format: str, lift: Recording, tmp_path: Path
+) -> None:
+    """It is not overwritten, and the hours of work are not lost."""
+    options, out, whole = Options(format=format), tmp_path / "out", tmp_path / "whole"
+    data.align_file(lift, SPEC, whole, options)
+
+    def appear(frames: int) -> None:
+        out.write_text("mine")
+
+    with pytest.raises(OutputError, match="has appeared in the meantime.*move it"):
+        data.align_file(lift, SPEC, out, options, progress=appear)
+    assert out.read_text() == "mine"
+    out.unlink()
+    assert data.align_file(lift, SPEC, out, options).resumed == 2
+    same(whole, out)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
+
+
+@pytest.mark.parametrize("left", ["other format", "folder", "file", "link", "align"])
+def test_what_is_in_the_way_is_not_deleted(left: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    partial = output.partial_path(out)
+    words = "is none of ours.*delete it"
+    if left == "folder":
+        partial.mkdir()
+        (partial / "data.hdf5").write_text("precious")
+    elif left == "file":
+        partial.write_text("precious")
+    elif left == "link":
+        partial.symlink_to(tmp_path / "nowhere")
+    else:
+        with open_recording(datasets.LIFT, datasets.robosuite()) as recording:
+            with pytest.raises(KeyboardInterrupt):
+                data.align_file(recording, SPEC, out, progress=Stop(20))
+        words = "begun by another" if left == "align" else "was begun with options"
+    before = {partial: partial.read_bytes()} if left == "file" else contents(partial)
+    if left == "align":
+        with pytest.raises(OutputError, match=words):
+            data.repair(datasets.LIFT, out)
+    else:
+        options = Options(format="lerobot" if left == "other format" else "robomimic")
+        with open_recording(datasets.LIFT, datasets.robosuite()) as recording:
+            with pytest.raises(OutputError, match=words):
+                data.align_file(recording, SPEC, out, options, trust=True)
+    after = {partial: partial.read_bytes()} if left == "file" else contents(partial)
+    assert after == before and not out.exists() and os.path.lexists(partial)
+
+
+def test_a_folder_with_nothing_but_its_recipe_is_in_nobodys_way(
+    lift: Recording, tmp_path: Path
+) -> None:
+    """Killed between giving the output its name and removing the folder; or before it was there."""
+    out = tmp_path / "out"
+    with output.begun(out, {"another": "command"}):
+        pass
+    (tmp_path / ".out.partial.new").mkdir()
+    (tmp_path / ".out.partial.lock").touch()
+    data.align_file(lift, SPEC, out)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("command", ["align", "repair"])
+def test_a_copy_of_a_video_that_was_interrupted(
+    command: str, front: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def half(file: Path, target: Path) -> None:
+        target.write_bytes(file.read_bytes()[:3000])
+        raise KeyboardInterrupt
+
+    def run() -> None:
+        if command == "repair":
+            data.repair(front, tmp_path / "out", robot=datasets.lerobot_calibration().robot)
+            return
+        with open_recording(front, datasets.lerobot_calibration()) as recording:
+            data.align_file(recording, SPEC, tmp_path / "out", Options(keep="all"))
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(lerobot_writer.shutil, "copyfile", half)
+        run()
+    run()
+    (video,), (copied,) = front.rglob("*.mp4"), (tmp_path / "out").rglob("*.mp4")
+    assert copied.read_bytes() == video.read_bytes()
+    assert data.verify(tmp_path / "out") == {}
 
 
 def test_outputs_are_never_overwritten(lift: Recording, aligned: Path, front: Path) -> None:
@@ -527,6 +968,152 @@ def test_flipped_bits_are_found(aligned: Path, tmp_path: Path) -> None:
         file["data/demo_1/obs/palm_image"][4, 30, 30, 1] ^= 1
     (problem,) = data.verify(path)["demo_1"]
     assert "obs/palm_image is not what was written" in problem
+
+
+@pytest.mark.parametrize("keep", ["numbers", "all"])
+def test_every_array_has_a_checksum(keep: str, tmp_path: Path) -> None:
+    """What is kept of the source, too, whatever it is; computed by hashlib alone."""
+    import hashlib
+
+    def add(file: h5py.File) -> None:
+        demo = file["data/demo_1"]
+        demo["note"], demo["extra/matrix"] = "some words", np.eye(3)
+        demo["extra/words"] = np.array(["a", "bc"], object)
+        demo["next_obs/robot0_eef_pos"] = demo["obs/robot0_eef_pos"][()]
+
+    (tmp_path / "source").mkdir()
+    source = datasets.changed(datasets.LIFT, tmp_path / "source", add)
+    with open_recording(source, datasets.robosuite()) as recording:
+        data.align_file(recording, SPEC, tmp_path / "whole.hdf5", Options(keep=keep, instead=True))
+    keys = list(arrays(tmp_path / "whole.hdf5", "demo_1"))
+    assert {"note", "extra/words", "source_actions", "next_obs/robot0_eef_pos"} <= set(keys)
+    with h5py.File(tmp_path / "whole.hdf5") as file:
+        hashes = json.loads(file["data/demo_1"].attrs["palm_sha256"])
+        for key in ("obs/robot0_eef_pos", "extra/matrix", "obs/palm_image"):
+            values = file["data/demo_1"][key][()]
+            expected = hashlib.sha256(f"{values.dtype.str}{values.shape[1:]}".encode())
+            expected.update(values.tobytes())
+            assert hashes[key] == expected.hexdigest(), key
+    assert set(hashes) == set(keys) and data.verify(tmp_path / "whole.hdf5") == {}
+    for key in keys:
+        path = tmp_path / "flipped.hdf5"
+        shutil.copyfile(tmp_path / "whole.hdf5", path)
+        with h5py.File(path, "r+") as file:
+            dataset = file["data/demo_1"][key]
+            values = dataset[()]
+            if key == "note":
+                dataset[()] = "other words"
+            elif key == "extra/words":
+                dataset[1] = "b"
+            else:
+                raw = bytearray(np.ascontiguousarray(values).tobytes())
+                raw[len(raw) // 2 - len(raw) // 2 % values.dtype.itemsize] ^= 1
+                dataset[...] = np.frombuffer(bytes(raw), values.dtype).reshape(values.shape)
+        assert f"{key} is not what was written" in " ".join(data.verify(path)["demo_1"]), key
+
+
+@pytest.mark.parametrize("command", ["align", "repair"])
+def test_every_file_of_a_set_has_a_checksum(command: str, front: Path, tmp_path: Path) -> None:
+    import hashlib
+
+    root, robot = tmp_path / "set", datasets.lerobot_calibration().robot
+    if command == "repair":
+        data.repair(front, root, robot=robot)
+    else:
+        with open_recording(front, datasets.lerobot_calibration()) as recording:
+            options = Options(keep="all", encoding="h264")
+            data.align_file(recording, SPEC, root, options)
+    files = {str(p.relative_to(root)): p for p in root.rglob("*") if p.is_file()}
+    hashes = json.loads(files.pop("meta/palm.json").read_text())["sha256"]
+    assert hashes == {n: hashlib.sha256(p.read_bytes()).hexdigest() for n, p in files.items()}
+    assert data.verify(root, robot=robot) == {}
+    for name, path in files.items():
+        whole = path.read_bytes()
+        if name.endswith("json"):
+            path.write_bytes(whole.replace(b"1", b"2", 1))
+        elif name.endswith("mp4"):
+            path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+        else:
+            path.write_bytes(whole[:10] + bytes([whole[10] ^ 1]) + whole[11:])
+        try:
+            found = data.verify(root, robot=robot)[""]
+            assert f"{name} is not what was written (sha256)" in found
+        except DataError:
+            assert name.endswith(("parquet", "info.json"))  # cannot even be opened
+        path.unlink()
+        if name.startswith("videos/"):
+            assert any(name in text for text in data.verify(root, robot=robot)[""])
+        path.write_bytes(whole)
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"sha256": 3}', '{"sha256": {"../x": "0"}}'])
+def test_checksums_of_strangers(content: str, front: Path, tmp_path: Path) -> None:
+    root = tmp_path / "set"
+    shutil.copytree(front, root)
+    (root / "meta/palm.json").write_text(content)
+    (problem,) = data.verify(root)[""]
+    assert "meta/palm.json cannot be read" in problem or "leads out of the data set" in problem
+
+    def write(file: h5py.File) -> None:
+        file["data/demo_0"].attrs["palm_sha256"] = content
+
+    path = datasets.changed(datasets.LIFT, tmp_path, write)
+    assert any("palm_sha256 cannot" in t or "missing" in t for t in data.verify(path)["demo_0"])
+
+
+@pytest.mark.parametrize(
+    "key", ["next_obs/image", "next_obs/pos", "extra/deep/numbers", "extra/words", "obs/mask"]
+)
+def test_verify_reads_every_array(key: str, tmp_path: Path) -> None:
+    def add(file: h5py.File) -> None:
+        demo, options = file["data/demo_1"], {"compression": "gzip", "chunks": True}
+        if key.endswith("words"):
+            demo.create_dataset(key, data=np.array([b"abc"] * 18), **options)
+        elif key.endswith(("image", "mask")):
+            demo.create_dataset(
+                key, data=demo[datasets.IMAGES][..., : 3 - ("mask" in key)], **options
+            )
+        else:
+            demo.create_dataset(key, data=np.zeros((18, 3)), **options)
+
+    def damage(file: h5py.File) -> None:
+        dataset = file["data/demo_1"][key]
+        info = dataset.id.get_chunk_info(dataset.id.get_num_chunks() - 1)
+        dataset.id.write_direct_chunk(info.chunk_offset, b"\0" * 50)
+
+    path = datasets.changed(datasets.LIFT, tmp_path, add)
+    assert data.verify(path) == {}
+    with h5py.File(path, "r+") as file:
+        damage(file)
+    assert f"{key} cannot be read" in data.verify(path)["demo_1"][0]
+
+
+def test_verify_reads_filter_keys(tmp_path: Path) -> None:
+    def add(file: h5py.File) -> None:
+        names = np.array([b"demo_0"] * 100)
+        file.create_dataset("mask/train", data=names, compression="gzip")
+        file["mask/train"].id.write_direct_chunk((0,), b"\0" * 50)
+
+    (problem,) = data.verify(datasets.changed(datasets.LIFT, tmp_path, add))[""]
+    assert "mask/train cannot be read" in problem
+
+
+def test_verify_reads_every_column(tmp_path: Path) -> None:
+    """A page that is damaged in a column that nothing else needs."""
+    import pyarrow.parquet as pq
+
+    words = [f"word {number}" for number in range(33)]
+    features = {"words": {"dtype": "string", "shape": [1], "names": None}}
+    root = changed_set(tmp_path, {"words": words}, features)
+    assert data.verify(root) == {}
+    file = root / "data/chunk-000/file-000.parquet"
+    group = pq.read_metadata(file).row_group(0)
+    column = group.column(group.num_columns - 1)
+    content = bytearray(file.read_bytes())
+    begin = column.dictionary_page_offset or column.data_page_offset
+    content[begin : begin + 40] = bytes(40)
+    file.write_bytes(content)
+    assert "not a whole parquet file" in data.verify(root)["0"][0]
 
 
 def test_verify_finds_what_does_not_add_up(tmp_path: Path) -> None:

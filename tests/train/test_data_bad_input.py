@@ -429,6 +429,14 @@ CASES: dict[str, Case] = {
         "EpisodeLengthError", ["31 poses and more images"],
         change=images(lambda i: np.concatenate([i, i[:3]])),
     ),
+    "no images in an episode": Case(
+        "EpisodeLengthError", ["31 poses and 0 images", "data repair"],
+        change=rows(datasets.IMAGES, 0),
+    ),
+    "no images in an episode, not looked at before": Case(
+        "EpisodeLengthError", ["31 poses and 0 images", "data repair"],
+        change=rows(datasets.IMAGES, 0), options=("--trust",),
+    ),
     # Options.
     "all of it in another format": Case(
         "OutputError", ["--keep all", "within one format"],
@@ -583,6 +591,20 @@ def test_a_disk_that_fills_up_on_the_way(
     assert "error: DiskFullError: " in message and "nothing half-written is left" in message
     assert [path.name for path in tmp_path.iterdir()] == ["calibration.json"]
     assert align(datasets.LIFT, out, *options) == 0  # and with room it works
+
+
+@pytest.mark.parametrize("format", ["robomimic", "lerobot"])
+@pytest.mark.parametrize("size", [0, 300, 5000])
+def test_a_disk_that_is_full_at_the_first_byte(
+    format: str, size: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "new"
+    path = calibration.save(datasets.robosuite(), tmp_path / "calibration.json")
+    with files_of_at_most(size):
+        assert align(datasets.LIFT, out, "--format", format, "--trust") == 2
+    message = capsys.readouterr().err
+    assert "error: DiskFullError: " in message and "nothing half-written is left" in message
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_disk_that_is_full_from_the_start(

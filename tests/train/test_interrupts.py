@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import time
+import weakref
 from pathlib import Path
 
 import pytest
@@ -274,3 +275,43 @@ def test_all_is_as_before_in_the_end() -> None:
     assert [signal.getsignal(number) for number in interrupts.SIGNALS] == handlers
     assert signal.set_wakeup_fd(-1) == -1
     assert len(os.listdir("/proc/self/fd")) == files
+
+
+class Thing:
+    """To be referred to weakly."""
+
+
+@pytest.mark.parametrize("number", interrupts.SIGNALS)
+def test_an_interrupt_in_a_callback_is_not_lost(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python drops what is raised there. That it is raised again is no second signal."""
+    ended: list[int] = []
+    monkeypatch.setattr(os, "_exit", ended.append)
+    monkeypatch.setattr(interrupts, "SAME", 0.0)
+    before, called = sys.unraisablehook, []
+
+    def interrupt(reference: object) -> None:
+        called.append(reference)
+        os.kill(os.getpid(), number)
+        time.sleep(0)  # the handler runs here at the latest
+
+    thing = Thing()
+    reference = weakref.ref(thing, interrupt)
+    with pytest.raises(KeyboardInterrupt), interrupts.raising():
+        del thing
+        assert called == [reference]
+        for _ in range(500):
+            time.sleep(0.01)
+        pytest.fail("the interrupt is lost")
+    assert sys.unraisablehook is before and not ended
+
+
+def test_other_exceptions_in_callbacks_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda dropped: told.append(dropped.exc_type))
+    thing = Thing()
+    reference = weakref.ref(thing, lambda reference: 1 / 0)
+    with interrupts.raising():
+        del thing
+    assert told == [ZeroDivisionError] and reference() is None

@@ -244,3 +244,45 @@ def test_a_training_takes_over_what_it_is_told_to(
     # It is no part of what the run is, and not proposed for the next time.
     assert "take_over" not in workspace.stored(config, "palm")
     assert "--take-over" not in configuration.resume_command(config)
+
+
+ALONE = HOLDER.replace("locks.claim", "locks.alone")
+
+
+def test_alone_does_not_wait_and_leaves_nothing(tmp_path: Path) -> None:
+    lock = tmp_path / ".x.lock"
+    process = subprocess.Popen(
+        [sys.executable, "-c", ALONE, lock],
+        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None and process.stdout.readline() == "held\n"
+    for _ in range(2):  # the first refusal has taken nothing away
+        with pytest.raises(locks.Busy, match="another process holds"), locks.alone(lock):
+            pass
+    process.kill()
+    process.communicate()
+    assert lock.exists()
+    with locks.alone(lock):
+        with pytest.raises(locks.Busy), locks.alone(lock):
+            pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def _alone(folder: Path, times: int) -> None:
+    for _ in range(times):
+        try:
+            with locks.alone(folder / ".x.lock"):
+                (folder / "in").mkdir()  # fails if another is in there
+                (folder / "in").rmdir()
+        except locks.Busy:
+            pass
+
+
+def test_alone_means_alone_also_while_the_file_is_deleted(tmp_path: Path) -> None:
+    spawn = multiprocessing.get_context("spawn")
+    others = [spawn.Process(target=_alone, args=(tmp_path, 2000)) for _ in range(3)]
+    for process in others:
+        process.start()
+    for process in others:
+        process.join()
+    assert [process.exitcode for process in others] == [0, 0, 0]

@@ -262,6 +262,19 @@ def test_a_lerobot_folder_is_one_or_refused(
         assert root.name in str(error), error
 
 
+def test_a_type_that_nobody_knows_is_no_number(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    root = datasets.lerobot(tmp_path)
+    info = json.loads((root / "meta" / "info.json").read_text())
+    for dtype in ("\ud800", "(3,", "a"):  # NumPy would read the last two as a language of its own
+        info["features"]["frame_index"]["dtype"] = dtype
+        (root / "meta" / "info.json").write_text(json.dumps(info))
+        with open_source(root) as source:
+            assert source.in_all(source.episodes)[1] == {"frame_index": f"{dtype}, not numbers"}
+    assert not recwarn.list
+
+
 _LEROBOT: list[Path] = []
 
 

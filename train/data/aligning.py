@@ -212,10 +212,23 @@ def ahead(items: Iterable[T], *, depth: int = _AHEAD) -> Iterator[T]:
         thread.join()
 
 
+def unequal(recording: Recording, episode: str, images: int | str) -> EpisodeLengthError:
+    """What to raise for an episode with another number of images than poses."""
+    poses = len(recording.trajectory(episode).tcp)
+    return EpisodeLengthError(
+        f"{recording.source.path}: {episode} has {poses} poses and {images} images; leave it out "
+        "with `data repair`"
+    )
+
+
 def _blocks(recording: Recording, episodes: Sequence[str]) -> Iterator[Block]:
     for name in episodes:
+        seen = 0
         for images in recording.source.blocks(name, recording.image_key, BLOCK):
             yield Block(name, images)
+            seen += len(images)
+        if not seen:  # it would not be missed
+            raise unequal(recording, name, 0)
 
 
 def stream(
@@ -252,7 +265,7 @@ def _aligned_blocks(
     for block in blocks:
         last = first + len(block.images)
         if last > length:
-            break
+            raise unequal(recording, block.episode, "more")
         yield align_frames(
             recording.camera.upright(block.images),
             recording.camera.camera(block.episode),
@@ -262,14 +275,8 @@ def _aligned_blocks(
             dist=recording.camera.dist,
         )
         first = last
-    else:
-        if first == length:
-            return
-    raise EpisodeLengthError(
-        f"{recording.source.path}: {block.episode} has {length} poses and "
-        f"{'more' if first < length and last > length else first} images; leave it out with "
-        "`data repair`"
-    )
+    if first < length:
+        raise unequal(recording, block.episode, first)
 
 
 def aligned_episodes(

@@ -30,7 +30,7 @@ from rich.table import Table
 from palm_jax._checks import OptionError
 from palm_jax.align import AlignSpec
 from palm_jax.train import console as terminal
-from palm_jax.train import interrupts
+from palm_jax.train import interrupts, records
 from palm_jax.train.data import aligning, check, importers, inspection, job, soundness
 from palm_jax.train.data import calibration as calib
 from palm_jax.train.data.calibration import Calibration, CameraCalibration, RobotKeys
@@ -376,7 +376,8 @@ class Check:
 
 def run_check(config: Check, console: Console) -> int:
     with open_recording(config.file, config.calibration, camera=config.camera) as recording:
-        out = config.out or Path(f"{config.file.stem}-{recording.camera.name}.png")
+        name = records.file_word(recording.camera.name)
+        out = config.out or Path(f"{config.file.stem}-{name}.png")
         check.check_sheet(out, config.file)
         report = check.check(recording, least=config.least_in_view, pixels=config.pixels)
         spec = aligning.paper_spec(recording.camera.height)
@@ -558,6 +559,8 @@ def run_align(config: Align, console: Console) -> int:
         f"{spec.proprio_size} numbers ({spec.layout})",
         markup=False,
     )
+    for key, why in result.skipped.items():
+        console.print(f"not kept: {key} ({why})", markup=False)
     console.print(f"written: {result.path}", markup=False)
     return 0
 
@@ -567,7 +570,7 @@ def run_align(config: Align, console: Console) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Verify:
-    """Is a data file whole? Reads everything.
+    """Is a data file whole? Reads everything; of videos it counts the frames.
 
     Attributes:
       file: robomimic HDF5 file, or folder of a LeRobot v3 data set.

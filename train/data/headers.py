@@ -115,10 +115,10 @@ def lerobot_info(info: Mapping[str, Any], where: str) -> None:
                 f"{_shown(entry)}"
             )
         an_object(entry.get("info") or {}, f"{where}: features: {key}: info")
-    videos = any(entry["dtype"] == "video" for entry in features.values())
     _path(info.get("data_path"), f"{where}: data_path")
-    if videos:
-        _path(info.get("video_path"), f"{where}: video_path", video_key="key")
+    for key, entry in features.items():
+        if entry["dtype"] == "video":
+            _path(info.get("video_path"), f"{where}: video_path", video_key=key)
 
 
 def _path(value: Any, where: str, **names: Any) -> None:
@@ -127,7 +127,7 @@ def _path(value: Any, where: str, **names: Any) -> None:
         if isinstance(value, str):
             value.format(chunk_index=0, file_index=0, **names)
             return
-    except (LookupError, ValueError, AttributeError):
+    except (LookupError, ValueError, AttributeError, TypeError):
         pass
     raise FormatError(
         f"{where}: expected a path with {{chunk_index}} and {{file_index}}, got {_shown(value)}"

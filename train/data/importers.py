@@ -18,6 +18,7 @@ import h5py
 import mujoco
 import numpy as np
 
+from palm_jax.train import hdf5_files
 from palm_jax.train.data import rotations
 from palm_jax.train.data.calibration import (
     CameraCalibration,
@@ -33,7 +34,7 @@ from palm_jax.train.data.errors import (
     KeyMissingError,
 )
 from palm_jax.train.data.recording import ambiguity
-from palm_jax.train.data.robomimic import open_hdf5
+from palm_jax.train.data.robomimic import open_hdf5, refuse
 from palm_jax.train.data.source import Source
 
 Cameras = dict[str, CameraCalibration]
@@ -333,6 +334,7 @@ def _sensors_of_file(path: Path) -> dict[str, Sensor]:
                 episodes = found.setdefault(parts[-2], {})
                 episodes.setdefault(parts[0], {})[parts[-1]] = item[()]
 
+        refuse(path, hdf5_files.way_out(file))
         file.visititems(note)
     return found
 

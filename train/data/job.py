@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import importlib.metadata
 import platform
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from palm_jax.train.data import aligning, motion, output
 from palm_jax.train.data.check import check_fit, reprojection
 from palm_jax.train.data.errors import DataError, OutputError
 from palm_jax.train.data.lerobot_writer import ENCODINGS, LeRobotWriter
-from palm_jax.train.data.output import Writer
+from palm_jax.train.data.output import Partial, Writer
 from palm_jax.train.data.recording import LEAST_IN_VIEW, Recording, Survey, check_view
 from palm_jax.train.data.robomimic_writer import COMPRESSIONS, RobomimicWriter, writing
 from palm_jax.train.metrics import plain
@@ -62,6 +63,11 @@ class Options:
                     f"{name}: expected one of {', '.join(map(str, known))}; got "
                     f"{getattr(self, name)!r}"
                 )
+        if re.fullmatch(r"[\w-]+", self.prefix) is None:
+            raise OutputError(
+                f"prefix: expected letters, digits, _ and -, got {self.prefix!r}; it begins the "
+                "new keys"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,10 +75,11 @@ class Result:
     """Of `align_file`."""
 
     path: Path
-    episodes: int
+    episodes: int  # that are in the new file
     frames: int
     resumed: int  # episodes that an earlier call had finished
     in_view: float  # share of frames with the TCP in the image
+    skipped: Mapping[str, str]  # keys of the source that the format cannot hold -> why
 
 
 def preflight(recording: Recording, *, least: float = LEAST_IN_VIEW, trust: bool = False) -> Survey:
@@ -153,22 +160,19 @@ def align_file(
       KeyboardInterrupt: finished episodes are kept for the next call.
     """
     options = options or Options()
+    options = dataclasses.replace(options, format=options.format or recording.source.format)
     output.check_free(out, recording.source.path)
     _check_spec(recording, spec, options)
     survey = preflight(recording, least=least, trust=trust)
     output.check_space(out, expected_bytes(recording, spec, survey, options))
-    with writing(out):
-        writer = _writer(recording, spec, out, options)
-        try:
-            _write(recording, spec, writer, options, progress or (lambda frames: None))
-            writer.complete()
-        except KeyboardInterrupt:
-            writer.stop()
-            raise
-        except BaseException:
-            writer.discard()
-            raise
-    return Result(out, survey.episodes, survey.frames, len(writer.done), survey.in_view)
+    with writing(out), output.begun(out, recipe(recording, spec, options)) as partial:
+        with _writer(recording, partial, options) as writer:
+            written = _write(recording, spec, writer, options, progress or (lambda frames: None))
+            assert list(written) == list(recording.source.episodes), "episodes are missing"
+            content = writer.complete()
+        partial.publish(content)
+    frames = sum(written.values())
+    return Result(out, len(written), frames, len(writer.done), survey.in_view, dict(writer.skipped))
 
 
 def _check_spec(recording: Recording, spec: AlignSpec, options: Options) -> None:
@@ -180,19 +184,18 @@ def _check_spec(recording: Recording, spec: AlignSpec, options: Options) -> None
             f"--crop: expected at most the {camera.width} x {camera.height} pixels of the images, "
             f"got {spec.crop}"
         )
-    to = options.format or recording.source.format
-    if to == "lerobot" and options.encoding != "png" and spec.size % 2:
+    if options.format == "lerobot" and options.encoding != "png" and spec.size % 2:
         raise OutputError(f"--size: expected an even number for video, got {spec.size}")
 
 
-def _writer(recording: Recording, spec: AlignSpec, out: Path, options: Options) -> Writer:
-    made = recipe(recording, spec, options)
+def _writer(recording: Recording, partial: Partial, options: Options) -> Writer:
+    source = recording.source
     given = {"keep": options.keep, "prefix": options.prefix, "instead": options.instead}
-    if (options.format or recording.source.format) == "lerobot":
-        return LeRobotWriter(out, recording.source, made, encoding=options.encoding, **given)  # type: ignore[arg-type]
-    if options.keep == "all" and recording.source.format != "robomimic":
+    if options.format == "lerobot":
+        return LeRobotWriter(partial, source, encoding=options.encoding, **given)  # type: ignore[arg-type]
+    if options.keep == "all" and source.format != "robomimic":
         raise OutputError("--keep all copies images as they are stored: within one format only")
-    return RobomimicWriter(out, recording.source, made, compression=options.compression, **given)  # type: ignore[arg-type]
+    return RobomimicWriter(partial, source, compression=options.compression, **given)  # type: ignore[arg-type]
 
 
 def _write(
@@ -201,10 +204,11 @@ def _write(
     writer: Writer,
     options: Options,
     progress: Callable[[int], None],
-) -> None:
-    finished = set(writer.done)
-    left = [name for name in recording.source.episodes if name not in finished]
-    progress(sum(recording.source.length(name) for name in finished))
+) -> dict[str, int]:
+    """Returns the frames of each episode that is in the output now."""
+    written = {name: recording.source.length(name) for name in writer.done}
+    left = [name for name in recording.source.episodes if name not in written]
+    progress(sum(written.values()))
     episodes = aligning.stream(recording, spec, episodes=left, transitions=options.transitions)
     try:
         for name, trajectory, actions, blocks in episodes:
@@ -214,11 +218,14 @@ def _write(
                 "opening": trajectory.opening.astype(np.float32),
             }
             writer.begin(name, len(actions), known)
+            written[name] = 0
             for image, proprio, valid in (
                 (np.asarray(b.image), np.asarray(b.proprio), np.asarray(b.valid)) for b in blocks
             ):
                 writer.add(image, {"proprio": proprio, "valid": valid})
                 progress(len(image))
+                written[name] += len(image)
             writer.end()
     finally:
         episodes.close()  # type: ignore[attr-defined]
+    return written

@@ -31,6 +31,12 @@ _INDEX = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _NAME = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 _PNG_LEVEL = 1
 
+NOTE, CHECKSUMS = "meta/palm.json", "sha256"
+"""How the set was made; in it {file: sha256} of all other files."""
+
+Tasks = tuple[list[str], list[str]]
+"""Of an episode, in words: all of them, and that of each frame."""
+
 ROBOMIMIC_NAMES = {"actions": "action", "rewards": "next.reward", "dones": "next.done"}
 
 
@@ -44,9 +50,8 @@ class LeRobotWriter(output.Writer):
     """See `output.Writer`.
 
     Args:
-      path: of the folder.
+      partial: where it is written; its recipe becomes meta/palm.json.
       source: what is kept comes from here.
-      recipe: how the output is made, written to meta/palm.json.
       keep: "numbers" (all but images), "all" or "none" of the source's columns.
       encoding: of the aligned images, one of `ENCODINGS`.
       prefix: of the new keys.
@@ -56,14 +61,13 @@ class LeRobotWriter(output.Writer):
 
     Raises:
       ExtraMissingError: without pyarrow.
-      OutputError: "all" of a source in another format.
+      OutputError: "all" of a source in another format; a new key that is kept of the source, too.
     """
 
     def __init__(
         self,
-        path: Path,
+        partial: output.Partial,
         source: Source,
-        recipe: Mapping[str, Any],
         *,
         keep: str,
         encoding: str,
@@ -75,36 +79,67 @@ class LeRobotWriter(output.Writer):
         self._pa, self._pq = video.extra("pyarrow"), video.extra("pyarrow.parquet")
         if keep == "all" and not isinstance(source, LeRobotSource):
             raise OutputError("--keep all copies images as they are stored: within one format only")
-        self.path, self.partial = path, output.partial_path(path)
-        self.source, self.keep, self.encoding = source, keep, encoding
+        self.partial, self.source, self.encoding = partial, source, encoding
         self.names = _names(prefix, instead)
-        self.recipe = recipe
+        self._kept = self._columns_kept(keep)
+        output.check_names(self._kept.values(), self.names.values())
         self._video: video.VideoWriter | None = None
-        if not self._resume():
-            output.remove(self.partial)
-            self.partial.mkdir(parents=True)
-            write_json(self.partial / "recipe.json", recipe)
+        # Episodes as they are finished; the data set that is made of them; the same when it is
+        # complete.
+        self._parts, self._set, self._whole = (
+            partial.folder / name for name in ("parts", "set", "whole")
+        )
+        self.done = self._finished()
 
-    def _resume(self) -> bool:
-        try:
-            found = json.loads((self.partial / "recipe.json").read_text())
-        except (OSError, ValueError):
-            return False
-        output.same_recipe(found, json.loads(json.dumps(self.recipe)), self.partial)
+    def _columns_kept(self, keep: str) -> dict[str, str]:
+        """Keys of the source -> what they are called beside the new ones."""
+        if keep == "none":
+            return {}
+        if isinstance(self.source, LeRobotSource):
+            features = self.source.info["features"]
+            names = {
+                key: key
+                for key, entry in features.items()
+                if keep == "all" or entry["dtype"] not in ("image", "video")
+            }
+        else:
+            keys, self.skipped = self.source.in_all(self.episodes)
+            names = {key: lerobot_name(key) for key in keys}
+            self.skipped |= {k: "LeRobot has its own" for k, n in names.items() if n in _INDEX}
+        old = {"observation.state": "source_state", "action": "source_action"}
+        new = set(self.names.values())
+        return {
+            key: old.get(name, name) if name in new else name
+            for key, name in names.items()
+            if name not in _INDEX
+        }
+
+    def _finished(self) -> tuple[str, ...]:
+        if self._whole.exists():
+            return self.episodes
         done: list[str] = []
         for name in self.episodes:
-            try:
-                note = json.loads(self._part(len(done)).with_suffix(".json").read_text())
-            except (OSError, ValueError):
-                break
-            if note["name"] != name:
+            note = self._note(len(done))
+            if note is None or note["name"] != name:
                 break
             done.append(name)
-        self.done = tuple(done)
-        return True
+        return tuple(done)
+
+    def _note(self, number: int) -> dict[str, Any] | None:
+        """What is known of a finished episode, if its files are what was written."""
+        try:
+            note: dict[str, Any] = json.loads(self._part(number).with_suffix(".json").read_text())
+            same = note["sha256"] == self._hashes(number)
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+        return note if same else None
+
+    def _hashes(self, number: int) -> list[str]:
+        files = [self._part(number)] + [self._mp4(number)] * (self.encoding != "png")
+        return [output.file_sha256(file) for file in files if file.exists()]
 
     def _part(self, number: int) -> Path:
-        return self.partial / "parts" / f"{number:06d}.parquet"
+        return self._parts / f"{number:06d}.parquet"
 
     # -- one episode -------------------------------------------------------------------------------
 
@@ -114,7 +149,7 @@ class LeRobotWriter(output.Writer):
         self._columns: dict[str, Any] = {}
         self._features: dict[str, Any] = {}
         self._stats: dict[str, dict[str, Any]] = {}
-        self._keep(name)
+        self._tasks = self._keep(name)
         self._blocks: dict[str, list[np.ndarray]] = {}
         self._pictures: list[dict[str, Any]] = []
         self._sums = np.zeros((2, 3))
@@ -122,9 +157,9 @@ class LeRobotWriter(output.Writer):
         for key, values in numbers.items():
             self._blocks[key] = [values]
 
-    def _mp4(self) -> Path:
-        place = _NAME.format(**_place(self._number))
-        return self.partial / "videos" / self.names["image"] / f"{place}.mp4"
+    def _mp4(self, number: int) -> Path:
+        place = _NAME.format(**_place(number))
+        return self._set / "videos" / self.names["image"] / f"{place}.mp4"
 
     def add(self, images: np.ndarray, numbers: Mapping[str, np.ndarray]) -> None:
         for key, values in numbers.items():
@@ -134,7 +169,9 @@ class LeRobotWriter(output.Writer):
         self._shape = images.shape[1:]
         if self.encoding != "png":
             if self._video is None:
-                self._video = video.VideoWriter(self._mp4(), self.source.fps, self.encoding)
+                self._video = video.VideoWriter(
+                    self._mp4(self._number), self.source.fps, self.encoding
+                )
             self._video.write(images)
             return
         for image in images:
@@ -150,22 +187,25 @@ class LeRobotWriter(output.Writer):
         if self._shape:
             self._put_images()
         frames = np.arange(self._length)
-        index: dict[str, np.ndarray] = {
-            "timestamp": (frames / self.source.fps).astype(np.float32),
-            "frame_index": frames,
-            "episode_index": np.full(self._length, self._number),
-        }
-        for key, values in index.items():
-            self._put(key, values)
+        if "timestamp" not in self._columns:  # the source's own
+            self._put("timestamp", (frames / self.source.fps).astype(np.float32))
+        self._put("frame_index", frames)
+        self._put("episode_index", np.full(self._length, self._number))
         part = self._part(self._number)
         part.parent.mkdir(exist_ok=True)
         self._pq.write_table(pa.table(self._columns), part, compression="snappy")
+        for file in (part, self._mp4(self._number)):
+            if file.exists():
+                output.sync(file)
+        words, each = self._tasks
         note = {
             "name": self._name,
             "length": self._length,
-            "task": self.source.task(self._name),
+            "tasks": words,
+            "task_of_frame": each,
             "features": self._features,
             "stats": self._stats,
+            "sha256": self._hashes(self._number),
         }
         write_json(part.with_suffix(".json"), note)  # last: it says that the part is whole
 
@@ -215,43 +255,51 @@ class LeRobotWriter(output.Writer):
             "count": [self._length],
         }
 
-    def _keep(self, name: str) -> None:
-        """Columns that come from the source."""
-        if self.keep == "none":
-            return
-        if not isinstance(self.source, LeRobotSource):
-            for key in self.source.number_keys:
-                self._put(self._free(lerobot_name(key)), self.source.numbers(name, key))
-            return
-        for key, entry in self.source.info["features"].items():
-            image = entry["dtype"] in ("image", "video")
-            if key in _INDEX or (image and self.keep != "all"):
+    def _keep(self, name: str) -> Tasks:
+        """Puts the columns that come from the source; returns what is done in the episode."""
+        source = self.source
+        if not isinstance(source, LeRobotSource):
+            for key, target in self._kept.items():
+                self._put(target, source.numbers(name, key))
+            return [source.task(name)], [source.task(name)] * source.length(name)
+        for key, target in self._kept.items():
+            entry = source.info["features"][key]
+            self._features[target] = entry
+            if entry["dtype"] == "video":
                 continue
-            self._features[self._free(key)] = entry
-            if entry["dtype"] != "video":
-                self._columns[self._free(key)] = self.source.column(name, key)
-
-    def _free(self, key: str) -> str:
-        """The key, or another name if the new ones include it."""
-        return f"source_{key.split('.')[-1]}" if key in self.names.values() else key
+            column = self._columns[target] = source.column(name, key)
+            if key in source.numeric:
+                values = source.as_numbers(name, key, column).astype(np.float64)
+                self._stats[target] = _stats(values.reshape(len(values), -1))
+        if "timestamp" in source.numeric:
+            self._put("timestamp", source.numbers(name, "timestamp").astype(np.float32))
+        return source.tasks(name)
 
     # -- the whole ---------------------------------------------------------------------------------
 
-    def stop(self) -> None:
+    def close(self) -> None:
         if self._video is not None:
             self._video.close()
             self._video = None
 
-    def discard(self) -> None:
-        self.stop()
-        output.remove(self.partial)
+    def complete(self) -> Path:
+        if not self._whole.exists():
+            self._make_set()
+            output.sync(self._set)
+            self._set.rename(self._whole)
+        output.remove(self._parts)
+        return self._whole
 
-    def complete(self) -> None:
+    def _make_set(self) -> None:
+        for name in ("data", "meta"):  # of an earlier call that came as far as this
+            output.remove(self._set / name)
         notes = [
             json.loads(self._part(number).with_suffix(".json").read_text())
             for number in range(len(self.episodes))
         ]
-        tasks = list(dict.fromkeys(note["task"] for note in notes))
+        tasks = list(dict.fromkeys(word for note in notes for word in note["tasks"]))
+        if isinstance(self.source, LeRobotSource):
+            tasks = self.source.in_order(tasks)
         rows = self._join(notes, tasks)
         for key, entry in notes[0]["features"].items():
             if entry["dtype"] == "video":
@@ -260,27 +308,27 @@ class LeRobotWriter(output.Writer):
             key: {"dtype": "int64", "shape": [1], "names": None} for key in ("index", "task_index")
         }
         self._write_meta(rows, notes, tasks, features)
-        shutil.rmtree(self.partial / "parts")
-        (self.partial / "recipe.json").unlink()
-        output.publish(self.partial, self.path)
+        files = sorted(file for file in self._set.rglob("*") if file.is_file())
+        hashes = {str(file.relative_to(self._set)): output.file_sha256(file) for file in files}
+        write_json(self._set / NOTE, self.partial.recipe | {CHECKSUMS: hashes})
 
     def _join(self, notes: Sequence[dict[str, Any]], tasks: list[str]) -> list[dict[str, Any]]:
         """The parts into data files; returns the rows of meta/episodes."""
         pa, rows, begin = self._pa, [], 0
         file, writer = -1, None
-        target = self.partial
+        target = self._set
         for number, note in enumerate(notes):
             part = self._part(number)
             table = self._pq.read_table(part)
             length = note["length"]
             table = table.append_column("index", pa.array(np.arange(begin, begin + length)))
-            task = np.full(length, tasks.index(note["task"]))
+            task = np.array([tasks.index(word) for word in note["task_of_frame"]])
             table = table.append_column("task_index", pa.array(task))
             if writer is None or target.stat().st_size >= DATA_MB * 2**20:
                 if writer is not None:
                     writer.close()
                 file += 1
-                target = self.partial / "data" / f"{_NAME.format(**_place(file))}.parquet"
+                target = self._set / "data" / f"{_NAME.format(**_place(file))}.parquet"
                 target.parent.mkdir(parents=True, exist_ok=True)
                 writer = self._pq.ParquetWriter(target, table.schema, compression="snappy")
             writer.write_table(table)  # a row group for each episode
@@ -288,7 +336,7 @@ class LeRobotWriter(output.Writer):
             rows.append(
                 {
                     "episode_index": number,
-                    "tasks": [note["task"]],
+                    "tasks": note["tasks"],
                     "length": length,
                     "data/chunk_index": place["chunk_index"],
                     "data/file_index": place["file_index"],
@@ -318,11 +366,18 @@ class LeRobotWriter(output.Writer):
             old = self.source.row(note["name"])
             row |= {f"videos/{key}/{c}": old[f"videos/{key}/{c}"] for c in columns}
             file, _ = self.source.video(note["name"], key)
-            place = {c: row[f"videos/{key}/{c}"] for c in columns[:2]}
-            target = self.partial / "videos" / key / f"{_NAME.format(**place)}.mp4"
+            place = {c: int(row[f"videos/{key}/{c}"]) for c in columns[:2]}
+            target = self._set / "videos" / key / f"{_NAME.format(**place)}.mp4"
             if not target.exists():
-                target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(file, target)
+                self._copy(file, target)
+
+    def _copy(self, file: Path, target: Path) -> None:
+        """Whole or not at all."""
+        target.parent.mkdir(parents=True, exist_ok=True)
+        new = self.partial.folder / "copy.mp4"
+        shutil.copyfile(file, new)
+        output.sync(new)
+        new.rename(target)
 
     def _write_meta(
         self,
@@ -331,14 +386,15 @@ class LeRobotWriter(output.Writer):
         tasks: list[str],
         features: dict[str, Any],
     ) -> None:
-        meta = self.partial / "meta"
+        meta = self._set / "meta"
         episodes = meta / "episodes" / "chunk-000" / "file-000.parquet"
         episodes.parent.mkdir(parents=True, exist_ok=True)
         self._pq.write_table(self._pa.Table.from_pylist(rows), episodes, compression="snappy")
         self._write_tasks(meta / "tasks.parquet", tasks)
         stats = {key: _pooled([n["stats"][key] for n in notes]) for key in notes[0]["stats"]}
-        if isinstance(self.source, LeRobotSource) and self.source.stats:
-            stats = {k: v for k, v in self.source.stats.items() if k in features} | stats
+        if isinstance(self.source, LeRobotSource) and self.episodes == self.source.episodes:
+            # Of images, which nobody has looked at here: right for all episodes only.
+            stats = {k: v for k, v in self.source.stats.items() if k in self._kept} | stats
         write_json(meta / "stats.json", stats)
         fps = self.source.fps
         videos = any(entry["dtype"] == "video" for entry in features.values())
@@ -363,7 +419,6 @@ class LeRobotWriter(output.Writer):
                 "features": features,
             },
         )
-        write_json(meta / "palm.json", self.recipe)
 
     def _write_tasks(self, path: Path, tasks: list[str]) -> None:
         """The table that pandas reads as a frame indexed by the task's name."""
@@ -381,6 +436,24 @@ class LeRobotWriter(output.Writer):
         }
         schema = table.schema.with_metadata({b"pandas": json.dumps(note).encode()})
         self._pq.write_table(table.cast(schema), path)
+
+
+def sound(source: LeRobotSource) -> list[str]:
+    """Problems of a data set against the checksums of its files; empty if it has none of either."""
+    try:
+        expected = dict(json.loads(source.inside(NOTE).read_text()).get(CHECKSUMS, {}))
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        return [f"{NOTE} cannot be read ({error})"]
+    problems = []
+    for name, value in expected.items():
+        try:
+            if output.file_sha256(source.inside(name)) != value:
+                problems.append(f"{name} is not what was written (sha256)")
+        except (OSError, ValueError) as error:
+            problems.append(f"{name} cannot be read ({error})")
+    return problems
 
 
 def _names(prefix: str, instead: bool) -> dict[str, str]:
@@ -410,8 +483,8 @@ def _pooled(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     squares = np.array([part["std"] for part in parts], float) ** 2 + means**2
     mean = (weights * means).sum(0)
     return {
-        "min": np.min([part["min"] for part in parts], 0).tolist(),
-        "max": np.max([part["max"] for part in parts], 0).tolist(),
+        "min": np.min(np.array([part["min"] for part in parts], float), 0).tolist(),
+        "max": np.max(np.array([part["max"] for part in parts], float), 0).tolist(),
         "mean": mean.tolist(),
         "std": np.sqrt(np.maximum((weights * squares).sum(0) - mean**2, 0.0)).tolist(),
         "count": [int(counts.sum())],

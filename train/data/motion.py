@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from palm_jax.align import Camera, distort_points
-from palm_jax.train.data.aligning import BLOCK
+from palm_jax.train.data.aligning import BLOCK, unequal
 from palm_jax.train.data.calibration import AXES, FLIPS, CameraCalibration, as_opencv, turned
 from palm_jax.train.data.recording import Recording, inside, projected
 from palm_jax.train.data.rotations import about
@@ -283,6 +283,8 @@ def _thumbnails(recording: Recording) -> list[tuple[str, np.ndarray, np.ndarray]
             pictures += [_thumbnail(image) for image in block]
             if len(pictures) >= _FRAMES // count:
                 break
+        if not pictures:
+            raise unequal(recording, name, 0)
         rows = min(len(pictures), len(tcp))
         result.append((name, np.stack(pictures[:rows]), tcp[:rows]))
     return result

@@ -1,18 +1,18 @@
 """Robomimic's HDF5 files: `data/demo_i/{actions, states, obs/*}`, images uint8 [T, H, W, 3].
 
-Reading is bound by decompression where images are compressed: chunks of whole frames are then
-decompressed in threads, which h5py by itself does not do, and by `isal`, where that is installed,
-in half the time.
+Reading is bound by decompression where images are compressed: their chunks are then decompressed in
+threads, which h5py by itself does not do, and by `isal`, where that is installed, in half the time.
 """
 
 from __future__ import annotations
 
 import importlib
+import itertools
 import json
 import os
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -20,14 +20,16 @@ from typing import Any
 import h5py
 import numpy as np
 
+from palm_jax.train import hdf5_files
 from palm_jax.train.data import headers
 from palm_jax.train.data.errors import FormatError, KeyMissingError, TruncatedError
 from palm_jax.train.data.source import Feature, Source
 
 CACHE_BYTES = 64 * 2**20
-"""For chunks that are larger than a block or cut frames into pieces."""
+"""For chunks that are not read past HDF5, and larger than a block or pieces of frames."""
 
 DEFAULT_FPS = 20.0
+_ROWS = 64
 
 REPAIR = "palm_repair"
 """Attribute of `data` in a file that `data repair` has written: what it left out, as JSON."""
@@ -76,15 +78,30 @@ def _stored(error: OSError) -> str:
 
 def is_image(dataset: h5py.Dataset) -> bool:
     """Whether a data set of an episode holds colour images."""
-    shape, dtype = dataset.shape, dataset.dtype
+    shape: tuple[int, ...] = dataset.shape or ()
+    dtype = dataset.dtype
     return bool(len(shape) == 4 and shape[-1] == 3 and dtype == np.uint8 and min(shape[1:3]) > 4)
 
 
-class RobomimicSource(Source):
-    """A robomimic file. See `Source`.
+def refuse(path: Path, wrong: str | None) -> None:
+    """Raises what `hdf5_files` has found.
 
     Raises:
-      TruncatedError, FormatError: see `open_hdf5`; no `data` group, or no episode in it.
+      FormatError: with what to do.
+    """
+    if wrong:
+        raise FormatError(
+            f"{path}: {wrong}; a file may have been merged of others in this way: write one that "
+            "holds all itself, with h5py's Group.copy(..., expand_soft=True, expand_external=True)"
+        )
+
+
+class RobomimicSource(Source):
+    """A robomimic file. See `Source`. Nothing is read from other files that this one refers to.
+
+    Raises:
+      TruncatedError, FormatError: see `open_hdf5`; no `data` group, or no episode in it; an episode
+        that lies in another file (where it is used).
     """
 
     format = "robomimic"
@@ -100,6 +117,8 @@ class RobomimicSource(Source):
             raise
 
     def _read_header(self) -> None:
+        for name in ("data", "mask"):
+            refuse(self.path, hdf5_files.link(self.file, name))
         data = self.file.get("data")
         if not isinstance(data, h5py.Group):
             raise FormatError(
@@ -107,6 +126,8 @@ class RobomimicSource(Source):
                 f"{', '.join(self.file) or 'nothing'})"
             )
         self.data = data
+        self._looked_at: set[str] = set()
+        self._look_at_masks()
         names = [name for name in data if self._is_episode(name)]
         if not names:
             raise FormatError(f"{self.path}: no episode in 'data'")
@@ -122,8 +143,17 @@ class RobomimicSource(Source):
             return headers.rate(told, f"{where}: control_freq")
         return headers.rate(self.data.attrs.get("fps", DEFAULT_FPS), f"{self.path}: fps")
 
+    def _look_at_masks(self) -> None:
+        try:
+            if isinstance(masks := self.file.get("mask"), h5py.Group):
+                refuse(self.path, hdf5_files.way_out(masks))
+        except (OSError, RuntimeError, KeyError):
+            pass  # damaged: an error where they are used
+
     def _is_episode(self, name: str) -> bool:
         try:
+            if hdf5_files.link(self.data, name):
+                return True
             return isinstance(self.data[name], h5py.Group)
         except (OSError, RuntimeError, KeyError):
             return True  # one that cannot be read is an error where it is used
@@ -133,8 +163,13 @@ class RobomimicSource(Source):
 
         Raises:
           TruncatedError: it cannot be read.
+          FormatError: it leads to another file.
         """
         try:
+            if episode not in self._looked_at:
+                refuse(self.path, hdf5_files.link(self.data, episode))
+                refuse(self.path, hdf5_files.way_out(self.data[episode]))
+                self._looked_at.add(episode)
             return self.data[episode]
         except (OSError, RuntimeError, KeyError) as error:
             raise TruncatedError(
@@ -184,6 +219,24 @@ class RobomimicSource(Source):
     def features(self) -> dict[str, Feature]:
         return self._features
 
+    def in_all(self, episodes: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+        found: dict[str, list[Any]] = {}
+        for name in episodes:
+            length = self.length(name)
+            for key, dataset in self.datasets(name, every=True):
+                if key.startswith("next_obs/") or is_image(dataset):
+                    continue
+                fits = dataset.dtype.kind in "biuf" and (dataset.shape or ())[:1] == (length,)
+                kind = (dataset.shape[1:], dataset.dtype) if fits else None
+                found.setdefault(key, []).append(kind)
+        why = {}
+        for key, kinds in found.items():
+            if None in kinds:
+                why[key] = "no numbers with a row for each frame"
+            elif len(kinds) < len(episodes) or len(set(kinds)) > 1:
+                why[key] = "not the same in all episodes"
+        return [key for key in found if key not in why], why
+
     def numbers(self, episode: str, key: str) -> np.ndarray:
         values: np.ndarray = self._read(self._dataset(episode, key), slice(None))
         return values
@@ -198,13 +251,34 @@ class RobomimicSource(Source):
             ) from error
         return values
 
+    def read_through(self, dataset: h5py.Dataset) -> None:
+        """Reads an array in blocks.
+
+        Raises:
+          TruncatedError: it cannot be read.
+        """
+        if not dataset.shape:
+            self._read(dataset, ())
+            return
+        for first in range(0, len(dataset), _ROWS):
+            self._read(dataset, slice(first, first + _ROWS))
+
+    def read_masks(self) -> None:
+        """Reads the filter keys.
+
+        Raises:
+          TruncatedError: one cannot be read.
+        """
+        for item in (self.file.get("mask") or {}).values():
+            self.read_through(item)
+
     def blocks(self, episode: str, key: str, size: int) -> Iterator[np.ndarray]:
         dataset = self._dataset(episode, key)
         per_chunk = dataset.chunks[0] if dataset.chunks else 1
         # Whole chunks, so that none is decompressed twice.
         size = max(1, size // per_chunk) * per_chunk
         read = self._read
-        if _whole_gzip(dataset):
+        if _is_gzip(dataset):
             read = self._gzipped
         elif self._plain(dataset):
             read = self._copied
@@ -217,8 +291,6 @@ class RobomimicSource(Source):
             dataset.chunks is None
             and dataset.dtype == np.uint8
             and dataset.id.get_offset() is not None
-            and not dataset.external
-            and not dataset.is_virtual
             and self.file.userblock_size == 0
             and self.file.driver == "sec2"
         )
@@ -241,23 +313,27 @@ class RobomimicSource(Source):
     def _gzipped(self, dataset: h5py.Dataset, rows: slice) -> np.ndarray:
         """Rows, decompressed in threads (zlib lets the others run, HDF5 does not)."""
         self._pool = self._pool or ThreadPoolExecutor(min(4, os.cpu_count() or 1))
-        per_chunk, zeros = dataset.chunks[0], (0,) * (dataset.ndim - 1)
-        block = np.empty((rows.stop - rows.start, *dataset.shape[1:]), np.uint8)
+        shape, chunk = dataset.shape, dataset.chunks
+        block = np.empty((rows.stop - rows.start, *shape[1:]), np.uint8)
 
-        def decompress(first: int, packed: bytes) -> None:
-            frames = np.frombuffer(_INFLATER.decompress(packed), np.uint8)
-            frames = frames.reshape(dataset.chunks)[: rows.stop - first]
-            block[first - rows.start : first - rows.start + len(frames)] = frames
+        def decompress(place: tuple[int, ...], packed: bytes) -> None:
+            part = np.frombuffer(_INFLATER.decompress(packed), np.uint8).reshape(chunk)
+            ends = (rows.stop, *shape[1:])  # a chunk at an edge is whole, and goes beyond it
+            sizes = [min(c, end - at) for c, end, at in zip(chunk, ends, place, strict=True)]
+            begins = (place[0] - rows.start, *place[1:])
+            target = tuple(slice(at, at + n) for at, n in zip(begins, sizes, strict=True))
+            block[target] = part[tuple(map(slice, sizes))]
 
+        steps = [range(0, size, step) for size, step in zip(shape[1:], chunk[1:], strict=True)]
         jobs = []
-        for first in range(rows.start, rows.stop, per_chunk):
+        for place in itertools.product(range(rows.start, rows.stop, chunk[0]), *steps):
             try:
-                mask, packed = dataset.id.read_direct_chunk((first, *zeros))
+                mask, packed = dataset.id.read_direct_chunk(place)
             except (OSError, RuntimeError):
                 return self._read(dataset, rows)  # never written: zeros, or the error with advice
             if mask:  # this chunk was stored without the filter
                 return self._read(dataset, rows)
-            jobs.append(self._pool.submit(decompress, first, packed))
+            jobs.append(self._pool.submit(decompress, place, packed))
         try:
             for job in jobs:
                 job.result()
@@ -302,7 +378,7 @@ class RobomimicSource(Source):
     def left_out(self) -> frozenset[str]:
         try:
             return frozenset(json.loads(self.data.attrs.get(REPAIR, "{}"))["dropped"])
-        except (ValueError, TypeError, LookupError):
+        except (ValueError, TypeError, LookupError, RecursionError):
             return frozenset()
 
     def close(self) -> None:
@@ -315,12 +391,11 @@ def _feature(dataset: h5py.Dataset) -> Feature:
     return Feature(tuple(dataset.shape[1:]), str(dataset.dtype), is_image(dataset))
 
 
-def _whole_gzip(dataset: h5py.Dataset) -> bool:
-    """Chunks of whole frames, compressed by gzip and nothing else. (Shuffling single bytes does
-    nothing, but may be there.)"""
+def _is_gzip(dataset: h5py.Dataset) -> bool:
+    """Chunks compressed by gzip and nothing else. (Shuffling single bytes does nothing, but may be
+    there.)"""
     return bool(
         dataset.compression == "gzip"
-        and dataset.chunks[1:] == dataset.shape[1:]
         and not dataset.fletcher32
         and dataset.scaleoffset is None
         and dataset.dtype == np.uint8

@@ -14,7 +14,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from palm_jax.train.data import output, robomimic_writer, video
+from palm_jax.train.data import lerobot_writer, output, robomimic_writer, video
 from palm_jax.train.data.calibration import RobotKeys
 from palm_jax.train.data.errors import (
     DataError,
@@ -23,7 +23,6 @@ from palm_jax.train.data.errors import (
     TruncatedError,
 )
 from palm_jax.train.data.lerobot import LeRobotSource
-from palm_jax.train.data.lerobot_writer import LeRobotWriter
 from palm_jax.train.data.recording import robot_columns, robot_keys, trajectory_of
 from palm_jax.train.data.robomimic import REPAIR, RobomimicSource
 from palm_jax.train.data.source import Source, fingerprint, open_source
@@ -37,8 +36,9 @@ _PER_FRAME = ("actions", "states", "rewards", "dones")
 def verify(path: Path, *, robot: RobotKeys | None = None) -> Problems:
     """Reads everything and reports what is wrong; empty if the file is sound.
 
-    Lengths, totals, poses that `data align` would take, finite actions, images that can be decoded
-    or counted, and the checksums of what `data align` has written.
+    Lengths, totals, poses that `data align` would take, finite actions, every array and column that
+    it can be read, images that they can be decoded (in videos: that they are there), and the
+    checksums of what `data align` has written.
 
     Args:
       path: file or folder.
@@ -94,6 +94,8 @@ def _episode(source: Source, name: str, keys: RobotKeys | None) -> list[str]:
                 problems.append(f"{key} has {count} images, expected {length}")
         if isinstance(source, RobomimicSource):
             problems += _hdf5_episode(source, name, length)
+        if isinstance(source, LeRobotSource):
+            _read_columns(source, name)
     except (DataError, OSError, RuntimeError, KeyError, ValueError) as error:
         problems.append(str(error).removeprefix(f"{source.path}: "))
     return problems
@@ -131,25 +133,38 @@ def _hdf5_episode(source: RobomimicSource, name: str, length: int) -> list[str]:
     told = demo.attrs.get("num_samples")
     if told is None or int(told) != length:
         problems.append(f"num_samples is {told}, expected {length}")
-    for key, dataset in source.datasets(name):
-        if not key.startswith("obs/") and key not in _PER_FRAME:
-            continue
-        if len(dataset) != length:
-            problems.append(f"{key} has {len(dataset)} rows, expected {length}")
-        elif dataset.dtype.kind != "u":
-            source.numbers(name, key)  # raises where it cannot be read
+    for key, dataset in source.datasets(name, every=True):
+        per_frame = key.startswith("obs/") or key in _PER_FRAME
+        if per_frame and dataset.dtype.kind in "biuf" and dataset.shape:
+            if len(dataset) != length:
+                problems.append(f"{key} has {len(dataset)} rows, expected {length}")
+                continue
+        if key not in source.image_keys:
+            source.read_through(dataset)
     return problems + robomimic_writer.sound(demo)
+
+
+def _read_columns(source: LeRobotSource, name: str) -> None:
+    """Raises where a column that holds no images cannot be read."""
+    for key, entry in source.info["features"].items():
+        if key not in source.image_keys and entry["dtype"] != "video":
+            source.column(name, key)
 
 
 def _totals(source: Source) -> list[str]:
     try:
         frames = sum(source.length(name) for name in source.episodes)
     except DataError:
-        return []  # the episode is reported by itself
+        return []  # told of the episode
+    problems: list[str] = []
     if isinstance(source, RobomimicSource):
         total = source.data.attrs.get("total")
-        return [] if total is None or total == frames else [f"total is {total}, not {frames}"]
-    problems = []
+        if total is not None and total != frames:
+            problems.append(f"total is {total}, not {frames}")
+        try:
+            source.read_masks()
+        except DataError as error:
+            problems.append(str(error).removeprefix(f"{source.path}: "))
     if isinstance(source, LeRobotSource):
         expected = {"total_episodes": len(source.episodes), "total_frames": frames}
         for key, value in expected.items():
@@ -161,6 +176,7 @@ def _totals(source: Source) -> list[str]:
             if begin != ends:
                 problems.append(f"episode {name} begins at {begin}, expected {ends}")
             ends = source.row(name)["dataset_to_index"]
+        problems += lerobot_writer.sound(source)
     return problems
 
 
@@ -195,30 +211,23 @@ def repair(path: Path, out: Path, *, robot: RobotKeys | None = None) -> Repair:
       DiskFullError: no space.
     """
     output.check_free(out, path)
-    partial = output.partial_path(out)
-    output.remove(partial)
-    with robomimic_writer.writing(out):
-        try:
-            with _opened(path) as source:
-                problems = {
-                    name: found
-                    for name in source.episodes
-                    if (found := _unsound(source, name, robot or RobotKeys()))
-                }
-                kept = [name for name in source.episodes if name not in problems]
-                if not kept:
-                    reasons = "; ".join(f"{n}: {r[0]}" for n, r in list(problems.items())[:3])
-                    raise OutputError(f"{path}: no sound episode to save ({reasons})")
-                numbers = _numbers(source, kept)
-                note = _note(source, problems, numbers)
-                if isinstance(source, RobomimicSource):
-                    _copy_hdf5(source, kept, partial, note)
-                    output.publish(partial, out)
-                else:
-                    _copy_lerobot(source, kept, out, note)
-        except BaseException:
-            output.remove(partial)
-            raise
+    with robomimic_writer.writing(out), _opened(path) as source:
+        problems = {
+            name: found
+            for name in source.episodes
+            if (found := _unsound(source, name, robot or RobotKeys()))
+        }
+        kept = [name for name in source.episodes if name not in problems]
+        if not kept:
+            reasons = "; ".join(f"{n}: {r[0]}" for n, r in list(problems.items())[:3])
+            raise OutputError(f"{path}: no sound episode to save ({reasons})")
+        numbers = _numbers(source, kept)
+        with output.begun(out, _note(source, problems, numbers)) as partial:
+            if isinstance(source, RobomimicSource):
+                content = _copy_hdf5(source, kept, partial)
+            else:
+                content = _copy_lerobot(source, kept, partial)
+            partial.publish(content)
     dropped = {name: reasons[0] for name, reasons in problems.items()}
     return Repair(out, tuple(kept), dropped, numbers)
 
@@ -347,14 +356,14 @@ def _end(dataset: h5py.Dataset) -> int:
     return max(ends)
 
 
-def _copy_hdf5(
-    source: RobomimicSource, kept: list[str], partial: Path, note: dict[str, Any]
-) -> None:
-    with h5py.File(partial, "w") as file:
+def _copy_hdf5(source: RobomimicSource, kept: list[str], partial: output.Partial) -> Path:
+    path = partial.folder / "data.hdf5"
+    path.unlink(missing_ok=True)
+    with h5py.File(path, "w") as file:
         data = file.create_group("data")
         for key, value in source.data.attrs.items():
             data.attrs[key] = value
-        data.attrs[REPAIR] = json.dumps(note)
+        data.attrs[REPAIR] = json.dumps(partial.recipe)
         data.attrs["total"] = sum(source.length(name) for name in kept)
         for name in kept:
             source.file.copy(source.data[name], data, name=name)
@@ -363,15 +372,16 @@ def _copy_hdf5(
             robomimic_writer.copy_masks(source.file, file, kept)
         except (OSError, RuntimeError, KeyError):
             pass  # beyond the end: filter keys can be made again
+    return path
 
 
-def _copy_lerobot(source: Source, kept: list[str], out: Path, note: dict[str, Any]) -> None:
+def _copy_lerobot(source: Source, kept: list[str], partial: output.Partial) -> Path:
     if not isinstance(source, LeRobotSource):
         raise FormatError(f"{source.path}: nothing known to repair")
-    writer = LeRobotWriter(
-        out, source, note, keep="all", encoding="png", prefix="palm", instead=False, episodes=kept
-    )
-    for name in kept:
-        writer.begin(name, source.length(name), {})
-        writer.end()
-    writer.complete()
+    with lerobot_writer.LeRobotWriter(
+        partial, source, keep="all", encoding="png", prefix="palm", instead=False, episodes=kept
+    ) as writer:
+        for name in kept[len(writer.done) :]:
+            writer.begin(name, source.length(name), {})
+            writer.end()
+        return writer.complete()

@@ -10,7 +10,7 @@ import abc
 import dataclasses
 import hashlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -76,6 +76,11 @@ class Source(abc.ABC):
     @abc.abstractmethod
     def image(self, episode: str, key: str, index: int) -> np.ndarray:
         """One image, uint8 [H, W, 3]."""
+
+    @abc.abstractmethod
+    def in_all(self, episodes: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+        """Keys of numbers that each of some episodes has in every frame, all of one kind; and why
+        others, images apart, are not among them."""
 
     def camera_info(self, episode: str) -> dict[str, dict[str, Any]]:
         """Camera name -> {"intrinsics", "extrinsics"} that the file itself has; empty if none."""

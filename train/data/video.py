@@ -29,6 +29,12 @@ def extra(name: str) -> ModuleType:
         ) from error
 
 
+def _opened(path: Path) -> Any:
+    """A video to read. FFmpeg is not left to guess: a playlist under a video's name makes it open
+    the files that are listed there, and a name like "concat:..." is no file to it."""
+    return extra("av").open(str(path.resolve()), format="mp4")
+
+
 def read(path: Path, start: float, fps: float, count: int, size: int) -> Iterator[np.ndarray]:
     """Frames of a video from a time on, decoded in order: uint8 [n, H, W, 3], `size` at a time.
 
@@ -48,7 +54,7 @@ def read(path: Path, start: float, fps: float, count: int, size: int) -> Iterato
     block: list[np.ndarray] = []
     found = 0
     try:
-        with av.open(str(path)) as container:
+        with _opened(path) as container:
             for image in _from(container, start, fps, count):
                 block.append(image)
                 found += 1
@@ -76,7 +82,7 @@ def count(path: Path, start: float, fps: float, frames: int) -> int:
     av = extra("av")
     found = set()
     try:
-        with av.open(str(path)) as container:
+        with _opened(path) as container:
             stream = container.streams.video[0]
             for packet in container.demux(stream):
                 if packet.pts is not None:
