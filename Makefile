@@ -13,10 +13,11 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-playground lint faults bench clean
+.PHONY: help demo test test-long test-playground lint faults bench clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
+	@echo "make test-long  what \`make test\` leaves out: real processes, killed again and again"
 	@echo "make test-playground  the tests of the MuJoCo Playground adapter, with Playground itself"
 	@echo "make lint   ruff and mypy only"
 	@echo "make faults kills, damages and fills whatever can be, and writes docs/reliability.md"
@@ -58,6 +59,9 @@ lint: $(VENV)/.test
 
 test: lint
 	$(BIN)/python -m pytest --numprocesses $(TEST_JOBS) --dist loadscope $(PYTEST_ARGS)
+
+test-long: $(VENV)/.test
+	$(BIN)/python -m pytest -m long --numprocesses $(TEST_JOBS) $(PYTEST_ARGS)
 
 # The import comes first because the tests skip themselves without the package.
 test-playground: $(VENV)/.playground

@@ -98,8 +98,15 @@ POINTS: dict[str, Callable[[Path], bool]] = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-@pytest.mark.parametrize("format", ["robomimic", "lerobot"])
+@pytest.mark.parametrize(
+    ("format", "number"),
+    [
+        ("robomimic", signal.SIGKILL),
+        pytest.param("robomimic", signal.SIGINT, marks=pytest.mark.long),
+        pytest.param("lerobot", signal.SIGKILL, marks=pytest.mark.long),
+        pytest.param("lerobot", signal.SIGINT, marks=pytest.mark.long),
+    ],
+)
 def test_killed_wherever_it_is(
     number: signal.Signals, format: str, source: Path, undisturbed: dict[str, dict], tmp_path: Path
 ) -> None:

@@ -132,6 +132,7 @@ def test_two_processes_train_and_checkpoint_together(one: Path, four: Path, tmp_
         np.testing.assert_array_equal(found, array)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", ["it raises", "it has other demonstrations"])
 def test_a_process_that_fails_ends_the_other(fault: str, one: Path, tmp_path: Path) -> None:

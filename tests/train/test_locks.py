@@ -280,7 +280,7 @@ def _alone(folder: Path, times: int) -> None:
 
 def test_alone_means_alone_also_while_the_file_is_deleted(tmp_path: Path) -> None:
     spawn = multiprocessing.get_context("spawn")
-    others = [spawn.Process(target=_alone, args=(tmp_path, 2000)) for _ in range(3)]
+    others = [spawn.Process(target=_alone, args=(tmp_path, 400)) for _ in range(3)]
     for process in others:
         process.start()
     for process in others:

@@ -2,9 +2,11 @@
 
 import dataclasses
 import errno
+import functools
 import json
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,14 @@ from palm_jax.train.data.recording import open_recording
 
 TINY = ["--steps", "4", "--width", "2", "--batch-size", "4", "--image-size", "32",
         "--random-crop", "28", "--checkpoint-every", "2", "--overlay-warmup", "1"]  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_once() -> Iterator[None]:
+    """A learner of the same configuration is the same one: what it has compiled, it keeps."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(learner, "make_learner", functools.cache(learner.make_learner))
+        yield
 
 
 @pytest.fixture(scope="module")

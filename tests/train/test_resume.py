@@ -11,6 +11,8 @@ import pytest
 
 WORDS: dict[str, Any] = {"steps": 24, "checkpoint_every": 5}
 
+pytestmark = pytest.mark.long
+
 
 def logged(folder: Path) -> list[dict[str, Any]]:
     path = folder / "metrics.jsonl"
@@ -26,7 +28,6 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
 def test_a_killed_run_resumes_bit_for_bit(reference: Path, tmp_path: Path) -> None:
     """SIGKILL between two checkpoints, twice: all that comes out is equal."""
     run = tmp_path / "run"
@@ -52,7 +53,6 @@ def test_a_killed_run_resumes_bit_for_bit(reference: Path, tmp_path: Path) -> No
     assert steps == list(range(1, 25))
 
 
-@pytest.mark.slow
 def test_the_seed_is_all_there_is(reference: Path, tmp_path: Path) -> None:
     """Two runs with one seed are identical; another seed gives other parameters."""
     for name, seed in (("again", 0), ("other", 1)):
