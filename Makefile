@@ -17,7 +17,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
-	@echo "make test-long  what \`make test\` leaves out: real processes, killed again and again"
+	@echo "make test-long  what \`make test\` leaves out because it takes long: killed processes above all"
 	@echo "make test-playground  the tests of the MuJoCo Playground adapter, with Playground itself"
 	@echo "make lint   ruff and mypy only"
 	@echo "make faults kills, damages and fills whatever can be, and writes docs/reliability.md"

@@ -32,6 +32,7 @@ def steer(key: jax.Array, images: jax.Array, proprio: jax.Array) -> jax.Array:
     return jnp.concatenate([rotation, move, closed], -1)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_one_scan_gives_the_runners_episodes() -> None:
     """Outcomes are equal, and the states that the policy sees agree to rounding."""

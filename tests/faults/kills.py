@@ -17,7 +17,7 @@ import play
 from faults import workers
 from faults.cases import Outcome, case, logged
 
-from palm_jax.train import checkpoint, interrupts, records, table, table_page
+from palm_jax.train import checkpoint, interrupts, locks, records, table, table_page
 
 KILLS = 25
 _SERVER = multiprocessing.get_context("forkserver")
@@ -162,7 +162,8 @@ def _three(folder: Path) -> Outcome:
     processes = [start(workers.run_table, folder) for _ in range(3)]
     for process in processes:
         process.join()
-        assert process.exitcode == 0, (folder / "output").read_text()[-3000:]
+        # Who ends before the others tells that cells are left to them.
+        assert process.exitcode in (0, locks.LEFT), (folder / "output").read_text()[-3000:]
     told = lines(folder)
     assert len(told) == len(set(told)), "a cell was run twice"
     content = records.load_json(folder / "table.json")
@@ -217,7 +218,8 @@ def _asked_twice(folder: Path) -> Outcome:
     expected = whole(workers.train, folder / "whole")
     stopped = folder / "stopped"
     process = start(functools.partial(workers.train, hesitation=60.0), stopped)
-    wait_for(process, stopped, 20)
+    # Five checkpoints with their scores, and one update: what it has to save takes a minute.
+    wait_for(process, stopped, 21)
     os.kill(process.pid or 0, signal.SIGTERM)
     while "Stopping after" not in (stopped / "output").read_text() and process.is_alive():
         time.sleep(0.01)

@@ -308,6 +308,7 @@ def test_reading_lerobot_needs_nothing_but_the_extra() -> None:
     assert run.stdout.strip() == "set()", run.stderr
 
 
+@pytest.mark.long
 def test_every_entry_of_info_json_may_be_odd(tmp_path: Path) -> None:
     """It is read, looked into and verified, or refused by name."""
     root = datasets.lerobot(tmp_path)
@@ -328,6 +329,7 @@ def test_every_entry_of_info_json_may_be_odd(tmp_path: Path) -> None:
     assert tried > 300 and refused > tried / 4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("attribute", ["data.env_args", "data/demo_0.camera_info"])
 def test_every_entry_of_a_robomimic_header_may_be_odd(attribute: str, tmp_path: Path) -> None:
     place, name = attribute.split(".")

@@ -53,7 +53,15 @@ def photos() -> Photos:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["palm", "palm-crop", "bc", "arro"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "palm",
+        "bc",
+        pytest.param("palm-crop", marks=pytest.mark.long),
+        pytest.param("arro", marks=pytest.mark.long),
+    ],
+)
 def test_policies_see_and_do_what_they_do_in_evaluations(name: str) -> None:
     """The evaluation renders the window itself; the policy cuts it out of a user's image."""
     taken, method, runner = photos(), methods.find(name), worlds.runner("lift_lid")
