@@ -87,7 +87,6 @@ def lerobot(folder: Path, *, fps: int = 20, short_video: int = 0) -> Path:
       fps: that it claims.
       short_video: frames that the video lacks at its end.
     """
-    import av
     import pyarrow as pa
     import pyarrow.parquet as pq
     from scipy.spatial.transform import Rotation
@@ -132,14 +131,27 @@ def lerobot(folder: Path, *, fps: int = 20, short_video: int = 0) -> Path:
     }.items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(table, root / name)
-    video.parent.mkdir(parents=True)
-    with av.open(str(video), "w") as container:
+    _write_video(video, images[: len(images) - short_video], fps)
+    info = json.dumps(_info(key, fps, episodes=len(rows), frames=begin))
+    (root / "meta" / "info.json").write_text(info)
+    return root
+
+
+def _write_video(path: Path, images: list[np.ndarray], fps: int) -> None:
+    import av
+
+    path.parent.mkdir(parents=True)
+    with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=fps, options={"crf": "8", "g": "6"})
         stream.width = stream.height = 128
         stream.pix_fmt = "yuv420p"
-        for image in images[: len(images) - short_video]:
+        for image in images:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode(None))
+
+
+def _info(key: str, fps: int, *, episodes: int, frames: int) -> dict[str, Any]:
+    """The content of meta/info.json."""
     one = {"shape": [1], "names": None}
     features = {
         key: {"dtype": "video", "shape": [3, 128, 128], "names": ["channels", "height", "width"]},
@@ -150,21 +162,19 @@ def lerobot(folder: Path, *, fps: int = 20, short_video: int = 0) -> Path:
         name: {"dtype": "int64", **one}
         for name in ("frame_index", "episode_index", "index", "task_index")
     }
-    info = {
+    return {
         "codebase_version": "v3.0",
         "robot_type": "panda",
         "fps": fps,
-        "total_episodes": len(rows),
-        "total_frames": begin,
+        "total_episodes": episodes,
+        "total_frames": frames,
         "total_tasks": 1,
         "chunks_size": 1000,
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
         "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
         "features": features,
-        "splits": {"train": f"0:{len(rows)}"},
+        "splits": {"train": f"0:{episodes}"},
     }
-    (root / "meta" / "info.json").write_text(json.dumps(info))
-    return root
 
 
 def lerobot_calibration(**options: Any) -> Calibration:

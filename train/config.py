@@ -1,5 +1,6 @@
 """What a training command is told: a frozen dataclass, a preset and the command line."""
 
+import abc
 import dataclasses
 import difflib
 import math
@@ -23,7 +24,7 @@ class ConfigError(ValueError):
 
 
 @dataclasses.dataclass(frozen=True)
-class Learning:
+class Learning(abc.ABC):
     """What a training is told whatever its data are.
 
     Attributes:
@@ -129,9 +130,9 @@ class Learning:
         except ValueError as error:
             raise ConfigError(str(error)) from error
 
+    @abc.abstractmethod
     def folder_name(self) -> str:
         """Of the run folder in runs/ where none is given."""
-        raise NotImplementedError
 
 
 @dataclasses.dataclass(frozen=True)

@@ -802,17 +802,7 @@ def run(
     config = learner.config
     split = Split(None) if devices is None else Split.over(devices)
     split.check(config.batch_size)
-    count = check_batch(data, learner.proprio_dim, learner.views, config.crop)
-    for name in ("proprio", "actions"):
-        if not np.isfinite(getattr(data, name)).all():
-            raise ValueError(f"{name} has non-finite values; filter the data first")
-    if config.overlay_fraction > 0 and bank is None:
-        raise ValueError(
-            "the configuration has a random overlay, but no bank of backgrounds was given; "
-            "pass one, e.g. align.procedural_bank(...), or set overlay_fraction=0"
-        )
-    if config.turns:
-        _check_cameras(data, learner.views)
+    count = _check_data(learner, data, bank)
     keys = RunKeys.from_seed(seed)
     if state is None:
         normalizer = fit_normalizer(data.proprio, data.actions)
@@ -846,6 +836,23 @@ def run(
     if on_checkpoint and checkpoint_every and saved != done:
         on_checkpoint(done, state)
     return state
+
+
+def _check_data(learner: Learner, data: Batch, bank: ArrayLike | None) -> int:
+    """Raises ValueError for data that a run cannot use; returns the number of samples."""
+    config = learner.config
+    count = check_batch(data, learner.proprio_dim, learner.views, config.crop)
+    for name in ("proprio", "actions"):
+        if not np.isfinite(getattr(data, name)).all():
+            raise ValueError(f"{name} has non-finite values; filter the data first")
+    if config.overlay_fraction > 0 and bank is None:
+        raise ValueError(
+            "the configuration has a random overlay, but no bank of backgrounds was given; "
+            "pass one, e.g. align.procedural_bank(...), or set overlay_fraction=0"
+        )
+    if config.turns:
+        _check_cameras(data, learner.views)
+    return count
 
 
 def _find_failure(

@@ -196,7 +196,7 @@ class _signals:
             try:
                 self._loop.add_signal_handler(number, self._event.set)
             except (NotImplementedError, RuntimeError, ValueError):
-                continue
+                continue  # Windows, or not the main thread: Ctrl-C then ends the server by itself
             self._added.append(number)
 
     def __exit__(self, *_: object) -> None:

@@ -378,7 +378,8 @@ def test_the_time_of_an_action_is_told(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_slightly_wrong_sensors_pass(policy: Policy) -> None:
     """A gripper that reads 1.02, a rotation that is rounded."""
-    policy.act(**{**GOOD, "opening": 1.02, "cam_to_world": CAMERA.round(4)})
+    target, gripper = policy.act(**{**GOOD, "opening": 1.02, "cam_to_world": CAMERA.round(4)})
+    assert np.isfinite(target).all() and gripper in (0.0, 1.0)
 
 
 @pytest.fixture

@@ -202,7 +202,8 @@ def test_clients_that_vanish_disturb_nobody(port: int) -> None:
             with raw(port) as gone:
                 gone.send(wire.pack(REQUEST))
                 gone.socket.shutdown(socket.SHUT_RDWR)
-        client.act(**REQUEST)
+        target, gripper = client.act(**REQUEST)
+        assert target.shape == (4, 4) and 0 <= gripper <= 1
 
 
 def test_pages_in_a_browser_are_not_let_in(port: int) -> None:
