@@ -1,27 +1,22 @@
 """Messages to a policy server that no client of ours would send."""
 
-import asyncio
 import contextlib
 import random
 import socket
 import struct
-import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import websockets.sync.client
 from faults.cases import Outcome, case
 from faults.fuzz import SECONDS, SHORT, mutate
+from serving import LIMIT, raw, serving
 from websockets.exceptions import ConnectionClosed
 
 from palm_jax import wire
-from palm_jax.train import serve
 from palm_jax.train.policy import Decision
 
-LIMIT = 10_000  # bytes of a message
 REQUEST: dict[str, Any] = {
     "image": np.zeros((20, 30, 3), np.uint8), "K": np.eye(3), "cam_to_world": np.eye(4),
     "tcp": np.eye(4), "opening": 0.25,
@@ -34,40 +29,6 @@ def _decide(*observation: Any, mask: Any) -> Decision:
     if image.dtype != np.uint8 or image.shape != (20, 30, 3) or tcp.shape != (4, 4):
         raise ValueError("image, tcp: expected other shapes")
     return Decision(np.eye(4, dtype=np.float32), float(opening), np.zeros(10, np.float32), 1.0)
-
-
-@contextlib.contextmanager
-def _serving() -> Iterator[int]:
-    """A server in a thread of its own; the port. It must end in order."""
-    ready: list[Any] = []
-    up = threading.Event()
-
-    async def run() -> None:
-        stop = asyncio.Event()
-
-        def started(port: int) -> None:
-            ready[:] = [port, stop, asyncio.get_running_loop()]
-            up.set()
-
-        server = serve.Server(_decide, {"method": "palm"}, max_bytes=LIMIT)
-        await server.run("127.0.0.1", 0, started=started, stop=stop)
-
-    thread = threading.Thread(target=lambda: asyncio.run(run()))
-    thread.start()
-    assert up.wait(20)
-    port, stop, loop = ready
-    try:
-        yield port
-    finally:
-        loop.call_soon_threadsafe(stop.set)
-        thread.join(20)
-        assert not thread.is_alive()
-
-
-def _connect(port: int) -> Any:
-    return websockets.sync.client.connect(
-        f"ws://127.0.0.1:{port}", max_size=None, proxy=None, compression=None
-    )
 
 
 def _served(client: Any) -> None:
@@ -112,7 +73,7 @@ for _name, (_message, _words) in _WRONG.items():
 
     @case("server", f"a message {_name}", message=_message, words=_words)
     def _wrong(folder: Path, message: str | bytes, words: str) -> Outcome:
-        with _serving() as port, _connect(port) as client:
+        with serving(_decide, {"method": "palm"}) as port, raw(port) as client:
             client.recv(timeout=10)
             client.send(message)
             answer = client.recv(timeout=10)
@@ -123,9 +84,9 @@ for _name, (_message, _words) in _WRONG.items():
 
 @case("server", "a message is many times too large")
 def _far_too_large(folder: Path) -> Outcome:
-    with _serving() as port, _connect(port) as other:
+    with serving(_decide, {"method": "palm"}) as port, raw(port) as other:
         other.recv(timeout=10)
-        with _connect(port) as client:
+        with raw(port) as client:
             client.recv(timeout=10)
             try:
                 client.send(bytes(100 * LIMIT))
@@ -155,7 +116,7 @@ for _name, _content in _BYTES.items():
 
     @case("server", f"the connection brings {_name}", content=_content)
     def _bytes(folder: Path, content: bytes) -> Outcome:
-        with _serving() as port, _connect(port) as other:
+        with serving(_decide, {"method": "palm"}) as port, raw(port) as other:
             other.recv(timeout=10)
             bad = socket.create_connection(("127.0.0.1", port))
             with contextlib.closing(bad), contextlib.suppress(ConnectionError):
@@ -171,7 +132,7 @@ for _long in (False, True):
           seconds=SECONDS if _long else SHORT)  # fmt: skip
     def _fuzzed(folder: Path, seconds: float) -> Outcome:
         good, rng = wire.pack(REQUEST), random.Random(1)
-        with _serving() as port, _connect(port) as client:
+        with serving(_decide, {"method": "palm"}) as port, raw(port) as client:
             client.recv(timeout=10)
             end, tried = time.monotonic() + seconds, 0
             while time.monotonic() < end or tried < 20:

@@ -1,6 +1,5 @@
 """The policy server: answers, refusals, other clients, and its end."""
 
-import asyncio
 import contextlib
 import os
 import re
@@ -10,7 +9,7 @@ import subprocess
 import sys
 import threading
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ import pytest
 import tiny
 import websockets.sync.client
 import websockets.sync.server
+from serving import raw, serving
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from palm_jax import policy_client, wire
@@ -54,48 +54,10 @@ def decide(image: Any, K: Any, cam_to_world: Any, tcp: Any, opening: Any, mask: 
     return Decision(target, 1.0, np.arange(10, dtype=np.float32), coverage)
 
 
-LIMIT = 10_000
-
-
-@contextlib.contextmanager
-def serving(decide: Callable[..., Decision], metadata: dict[str, Any]) -> Iterator[int]:
-    """A server in a thread of its own; the port."""
-    ready: list[Any] = []
-    up = threading.Event()
-
-    async def run() -> None:
-        stop = asyncio.Event()
-
-        def started(port: int) -> None:
-            ready[:] = [port, stop, asyncio.get_running_loop()]
-            up.set()
-
-        server = serve.Server(decide, metadata, max_bytes=LIMIT)
-        await server.run("127.0.0.1", 0, started=started, stop=stop)
-
-    thread = threading.Thread(target=lambda: asyncio.run(run()))
-    thread.start()
-    assert up.wait(20)
-    port, stop, loop = ready
-    try:
-        yield port
-    finally:
-        loop.call_soon_threadsafe(stop.set)
-        thread.join(20)
-        assert not thread.is_alive()
-
-
 @pytest.fixture(scope="module")
 def port() -> Iterator[int]:
     with serving(decide, {"method": "palm", "rate": 20.0}) as port:
         yield port
-
-
-def raw(port: int, **options: Any) -> contextlib.AbstractContextManager[Any]:
-    """A connection as any program may open it."""
-    return websockets.sync.client.connect(
-        f"ws://127.0.0.1:{port}", max_size=None, proxy=None, compression=None, **options
-    )
 
 
 def test_a_client_of_the_convention_is_served(port: int) -> None:
