@@ -27,6 +27,7 @@ import logging
 import math
 import os
 import shutil
+import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -166,11 +167,21 @@ def save(
         final = directory / str(step)
         _put_in_place(temporary, final)
     except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
+        _clear(temporary)
         raise
     if keep is not None:
         prune(directory, keep=keep)
     return final
+
+
+def _clear(temporary: Path) -> None:
+    """Delete what a failed save has written. Orbax raises with its first write that fails, while
+    threads of it finish theirs and make the folder anew: gone is what stays away for a while."""
+    absent, end = 0, time.monotonic() + 5.0
+    while absent < 5 and time.monotonic() < end:
+        shutil.rmtree(temporary, ignore_errors=True)
+        time.sleep(0.05)
+        absent = 0 if temporary.exists() else absent + 1
 
 
 def _write_arrays(path: Path, named: Mapping[str, Any]) -> None:

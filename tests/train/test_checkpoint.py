@@ -8,6 +8,8 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -415,6 +417,29 @@ def test_an_error_while_writing_leaves_nothing(
     with pytest.raises(OSError, match="no space"):
         checkpoint.save(folder, 3, make_tree(3))
     assert sorted(path.name for path in folder.iterdir()) == ["1", "2"]
+
+
+def test_a_failed_save_outlasts_threads_that_go_on_writing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Orbax raises with the first of its writes that fails, while others are still under way."""
+    writers = []
+
+    def fail(path: Path, tree: Any) -> None:
+        def write_late() -> None:
+            time.sleep(0.1)
+            path.mkdir(parents=True, exist_ok=True)
+            (path / "late").write_bytes(b"...")
+
+        writers.append(threading.Thread(target=write_late))
+        writers[0].start()
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(checkpoint, "_orbax_save", fail)
+    with pytest.raises(OSError, match="No space"):
+        checkpoint.save(tmp_path, 1, make_tree(1))
+    writers[0].join()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_writer_that_is_alive_is_not_disturbed(folder: Path) -> None:
