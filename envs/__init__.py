@@ -9,6 +9,11 @@ if __name__ != "palm_jax.envs":
         "would have its own, incompatible classes (`palm_jax/envs` is a link to `envs/`)."
     )
 
+from palm_jax._quiet import without_lines
+
+with without_lines():
+    import mujoco.mjx  # noqa: F401  first here, where what it prints is dropped
+
 from palm_jax.envs.registry import ROBOTS as ROBOTS
 from palm_jax.envs.registry import TASKS as TASKS
 from palm_jax.envs.registry import make as make

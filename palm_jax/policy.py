@@ -3,20 +3,17 @@
 See `palm_jax.train.policy`, whose names these are, and docs/deploy.md.
 """
 
-from palm_jax._quiet import without_lines
-
-with without_lines():
-    from palm_jax.train.policy import (
-        CalibrationError,
-        Contract,
-        Decision,
-        Latency,
-        NonFiniteActionError,
-        OutsideTrainingError,
-        Policy,
-        PolicyError,
-        load,
-    )
+from palm_jax.train.policy import (
+    CalibrationError,
+    Contract,
+    Decision,
+    Latency,
+    NonFiniteActionError,
+    OutsideTrainingError,
+    Policy,
+    PolicyError,
+    load,
+)
 
 __all__ = [
     "CalibrationError",

@@ -153,6 +153,13 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
     assert run.stdout.strip() == "set()", run.stderr
 
 
+def test_importing_prints_nothing() -> None:
+    """MJX prints when it is imported without its optional back end."""
+    code = "import palm_jax.envs, palm_jax.policy"
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+
+
 def test_links_point_at_the_real_folders() -> None:
     for name in ("envs", "train"):
         link = ROOT / "palm_jax" / name

@@ -5,8 +5,6 @@ import traceback
 import warnings
 from collections.abc import Sequence
 
-from palm_jax._quiet import without_lines
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns 0, or 2 for a command that cannot be run, 130 when interrupted."""
@@ -14,19 +12,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not any(word in ("-h", "--help") or word.startswith("--distributed") for word in words):
         print("palm_jax: loading JAX and MuJoCo ...", flush=True)
     warnings.filterwarnings("ignore", message=".*donated buffers were not usable.*")
-    with without_lines():  # MJX's complaints about the missing warp back end
-        from palm_jax._checks import OptionError
-        from palm_jax.envs.rollout import StartPoseError
-        from palm_jax.train import config as configuration
-        from palm_jax.train import console as terminal
-        from palm_jax.train import devices, interrupts, recorded, run, training
-        from palm_jax.train.checkpoint import CheckpointError
-        from palm_jax.train.data.errors import DataError
-        from palm_jax.train.demos import DemoFileError
-        from palm_jax.train.evaluate import out_of_memory
-        from palm_jax.train.learner import NonFiniteError
-        from palm_jax.train.locks import Busy
-        from palm_jax.train.records import RecordError
+    from palm_jax._checks import OptionError
+    from palm_jax.envs.rollout import StartPoseError
+    from palm_jax.train import config as configuration
+    from palm_jax.train import console as terminal
+    from palm_jax.train import devices, interrupts, recorded, run, training
+    from palm_jax.train.checkpoint import CheckpointError
+    from palm_jax.train.data.errors import DataError
+    from palm_jax.train.demos import DemoFileError
+    from palm_jax.train.evaluate import out_of_memory
+    from palm_jax.train.learner import NonFiniteError
+    from palm_jax.train.locks import Busy
+    from palm_jax.train.records import RecordError
 
     console = terminal.make_console()
     try:
