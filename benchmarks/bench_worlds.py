@@ -19,7 +19,7 @@ from benchmarks import common, replay, soundness
 from palm_jax.envs import ROBOTS, TASKS, make, shifts
 from palm_jax.envs.base import Env, EnvParams, State
 from palm_jax.envs.rollout import Runner, repeat_params
-from palm_jax.train import figures, grids
+from palm_jax.train.reporting import figures, grids
 
 DOMAINS = ("in_domain", "workspace")
 CELLS = (4, 7)

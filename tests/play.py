@@ -22,23 +22,14 @@ import jax
 import numpy as np
 from faults.damaged_files import demonstrations
 
-from palm_jax.train import (
-    checkpoint,
-    devices,
-    evaluate,
-    interrupts,
-    learner,
-    report,
-    run,
-    training,
-    workspace,
-)
+from palm_jax.train import checkpoint, evaluate, learner, report, run, training, workspace
 from palm_jax.train.config import Config
 from palm_jax.train.evaluate import Evaluator, Runners
+from palm_jax.train.files.metrics import MetricsLog
+from palm_jax.train.files.records import DomainRecord
+from palm_jax.train.host import devices, interrupts
 from palm_jax.train.learner import Learner, LearnerConfig, PolicyState
 from palm_jax.train.methods import Method
-from palm_jax.train.metrics import MetricsLog
-from palm_jax.train.records import DomainRecord
 
 PROPRIO = 3
 SAMPLES = 30

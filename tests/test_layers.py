@@ -124,6 +124,16 @@ def test_only_train_touches_files_and_clocks(path: Path) -> None:
     assert not WRITERS & set(calls(source))
 
 
+@pytest.mark.parametrize("path", TRAIN, ids=ids)
+def test_parts_of_train_know_only_what_lies_below(path: Path) -> None:
+    part = path.relative_to(ROOT / "train").parts[0]
+    below = {"files": ["files"], "host": ["host"], "reporting": ["files", "reporting"]}.get(part)
+    ours = [name for name in imported(path.read_text()) if within(name, "palm_jax.train")]
+    if below is not None:
+        known = ("palm_jax.train", *(f"palm_jax.train.{part}" for part in below))
+        assert not [name for name in ours if name != known[0] and not within(name, *known[1:])]
+
+
 def test_the_checks_see_an_offence() -> None:
     assert offences("def f():\n    from mujoco import mjx", "mujoco") == ["mujoco", "mujoco.mjx"]
     assert offences("import palm_jax.envs.base as b", "palm_jax.envs") == ["palm_jax.envs.base"]

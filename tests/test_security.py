@@ -20,12 +20,15 @@ import pytest
 from PIL import EpsImagePlugin, Image
 
 from palm_jax.__main__ import main
-from palm_jax.train import checkpoint, demos, pictures, records, report, table_page, torch_files
+from palm_jax.train import checkpoint, demos, report
 from palm_jax.train import data as recordings
 from palm_jax.train.checkpoint import DamagedCheckpoint
 from palm_jax.train.data.errors import FormatError, TruncatedError
 from palm_jax.train.data.importers import from_maniskill
 from palm_jax.train.data.source import open_source
+from palm_jax.train.files import pictures, records
+from palm_jax.train.files import torch as torch_files
+from palm_jax.train.reporting import table_page
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = sorted(
@@ -38,7 +41,7 @@ SOURCES = sorted(
 UNPICKLERS = {"pickle", "_pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal",
               "pandas", "yaml", "torch"}  # fmt: skip
 """Modules that run what a file says, or have a reader that does."""
-MAY_IMPORT = {"train/torch_files.py": {"pickle"}}
+MAY_IMPORT = {"train/files/torch.py": {"pickle"}}
 RUNS = {"eval", "exec", "compile", "__import__"}
 UNPACKS = {"extractall", "extract", "unpack_archive", "popen", "mktemp"}
 
@@ -111,7 +114,7 @@ def test_the_search_lets_pass_what_is_safe() -> None:
     )
     assert list(offences(safe)) == [] and len(SOURCES) > 60
     # The one that reads .pth files names what it knows, and calls no ready-made loader.
-    assert list(offences((ROOT / "train/torch_files.py").read_text())) == ["import pickle"]
+    assert list(offences((ROOT / "train/files/torch.py").read_text())) == ["import pickle"]
 
 
 # ---------------------------------------------------------------------------------------- arrays

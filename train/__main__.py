@@ -15,15 +15,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     from palm_jax._checks import OptionError
     from palm_jax.envs.rollout import StartPoseError
     from palm_jax.train import config as configuration
-    from palm_jax.train import console as terminal
-    from palm_jax.train import devices, interrupts, recorded, run, training
+    from palm_jax.train import recorded, run, training
     from palm_jax.train.checkpoint import CheckpointError
     from palm_jax.train.data.errors import DataError
     from palm_jax.train.demos import DemoFileError
     from palm_jax.train.evaluate import out_of_memory
+    from palm_jax.train.files.locks import Busy
+    from palm_jax.train.files.records import RecordError
+    from palm_jax.train.host import devices, interrupts
     from palm_jax.train.learner import NonFiniteError
-    from palm_jax.train.locks import Busy
-    from palm_jax.train.records import RecordError
+    from palm_jax.train.reporting import console as terminal
 
     console = terminal.make_console()
     try:

@@ -38,8 +38,8 @@ import numpy as np
 import orbax.checkpoint as orbax
 from orbax.checkpoint import v1 as ocp
 
-from palm_jax.train import versions
-from palm_jax.train.metrics import fsync_folder, plain, write_atomic
+from palm_jax.train.files import versions
+from palm_jax.train.files.metrics import fsync_folder, plain, write_atomic
 
 FORMAT = "palm_jax.checkpoint"
 VERSION = 1

@@ -26,8 +26,8 @@ from palm_jax.align import AlignSpec, Camera
 from palm_jax.envs.base import PAPER_FRAME, Env, EnvParams, State
 from palm_jax.envs.expert import Demonstrator, Recording
 from palm_jax.envs.rollout import Runner, repeat_params, take_params
-from palm_jax.train import hdf5_files
-from palm_jax.train.metrics import write_atomic
+from palm_jax.train.files import hdf5 as hdf5_files
+from palm_jax.train.files.metrics import write_atomic
 
 FORMAT = "palm_jax-demos"
 VERSION = 2

@@ -12,10 +12,10 @@ from palm_jax.envs import registry, shifts
 from palm_jax.envs.base import EnvParams, State
 from palm_jax.envs.rollout import Act, Episodes, Runner, take_params
 from palm_jax.envs.tasks import Task
-from palm_jax.train import devices
+from palm_jax.train.files.records import DomainRecord
+from palm_jax.train.host import devices
 from palm_jax.train.learner import NOISE_ROWS, Learner, PolicyState
 from palm_jax.train.methods import Method
-from palm_jax.train.records import DomainRecord
 
 Watch = Callable[[State], None]
 Result = TypeVar("Result")

@@ -20,9 +20,9 @@ import tyro
 from jax import export as jax_export
 
 from palm_jax._checks import check_choice
-from palm_jax.train import console as terminal
-from palm_jax.train.metrics import write_atomic, write_json
+from palm_jax.train.files.metrics import write_atomic, write_json
 from palm_jax.train.policy import IMAGE_SIZE, Policy, PolicyError, describe, load
+from palm_jax.train.reporting import console as terminal
 
 FORMAT = "palm_jax.export"
 VERSION = 1

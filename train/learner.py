@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike
 
 from palm_jax import align
 from palm_jax.train import model
-from palm_jax.train.devices import Split
+from palm_jax.train.host.devices import Split
 
 ACTION_DIM = 10  # 6D rotation, xyz, gripper
 ROTATION = slice(0, 6)

@@ -28,7 +28,7 @@ import numpy as np
 from flax import nnx
 from jax import lax
 
-from palm_jax.train import torch_files
+from palm_jax.train.files import torch as torch_files
 
 Params = dict[str, Any]  # nested dict of arrays
 NORMS = ("batch", "group")

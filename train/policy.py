@@ -51,9 +51,10 @@ from palm_jax.envs.base import (
 )
 from palm_jax.envs.registry import TASKS
 from palm_jax.envs.tasks import WORKSPACE_CENTRE
-from palm_jax.train import checkpoint, methods, records, runs, workspace
+from palm_jax.train import checkpoint, methods, workspace
 from palm_jax.train.config import Config, Recorded
 from palm_jax.train.evaluate import VIEW
+from palm_jax.train.files import records
 from palm_jax.train.learner import (
     Learner,
     PolicyState,
@@ -61,6 +62,7 @@ from palm_jax.train.learner import (
     make_learner,
     to_action,
 )
+from palm_jax.train.reporting import runs
 
 IMAGE_SIZE = (480, 640)
 """Rows and columns of the images for which a policy is compiled unless told otherwise."""

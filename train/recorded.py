@@ -18,27 +18,17 @@ import numpy as np
 from rich.console import Console
 
 from palm_jax.align import AlignSpec, Camera, window_origin
-from palm_jax.train import (
-    checkpoint,
-    devices,
-    figures,
-    held_out,
-    learner,
-    locks,
-    methods,
-    paper,
-    records,
-    report,
-    training,
-    workspace,
-)
-from palm_jax.train import console as terminal
+from palm_jax.train import checkpoint, held_out, learner, methods, report, training, workspace
 from palm_jax.train.config import ConfigError, Recorded, default_out
 from palm_jax.train.data import aligning, job
 from palm_jax.train.data.errors import TcpOutOfViewError, disk_full
 from palm_jax.train.data.recording import Recording, Survey, open_recording
 from palm_jax.train.evaluate import VIEW
-from palm_jax.train.metrics import plain, write_json
+from palm_jax.train.files import locks, records
+from palm_jax.train.files.metrics import plain, write_json
+from palm_jax.train.host import devices
+from palm_jax.train.reporting import console as terminal
+from palm_jax.train.reporting import figures, paper
 
 DEFAULT_SHARE = 0.1
 """Of the episodes, held out where neither the user nor the file says which."""

@@ -1,7 +1,7 @@
 """`python -m palm_jax report RUN|DIR`: everything about one or more runs on one HTML page.
 
 The page is one file without scripts or outside requests: styles inline, pictures and videos as
-base64. It is built from what the run folders hold (`palm_jax.train.records`). A missing input
+base64. It is built from what the run folders hold (`palm_jax.train.files.records`). A missing input
 leaves its part out; a damaged one is named on the page, and the rest is shown.
 
 DIR may be one run, or hold runs at any depth: methods, seeds and tasks are read from each
@@ -23,10 +23,11 @@ import tyro
 from matplotlib.figure import Figure
 
 from palm_jax import __version__
-from palm_jax.train import figures, grids, paper, records
-from palm_jax.train.console import duration
-from palm_jax.train.metrics import write_atomic
-from palm_jax.train.page import (
+from palm_jax.train.files import records
+from palm_jax.train.files.metrics import write_atomic
+from palm_jax.train.reporting import figures, grids, paper
+from palm_jax.train.reporting.console import duration
+from palm_jax.train.reporting.page import (
     CSS,
     damaged_media,
     esc,
@@ -39,7 +40,7 @@ from palm_jax.train.page import (
     tiles,
     video,
 )
-from palm_jax.train.runs import (
+from palm_jax.train.reporting.runs import (
     Run,
     find_runs,
     grouped,

@@ -14,24 +14,7 @@ from rich.console import Console
 
 from palm_jax.envs import physics, shifts
 from palm_jax.envs.rollout import Runner
-from palm_jax.train import console as terminal
-from palm_jax.train import (
-    demos,
-    devices,
-    figures,
-    films,
-    interrupts,
-    learner,
-    locks,
-    methods,
-    records,
-    report,
-    sweep,
-    training,
-    transforms,
-    videos,
-    workspace,
-)
+from palm_jax.train import demos, learner, methods, report, sweep, training, transforms, workspace
 from palm_jax.train.config import Config, ConfigError, default_out
 from palm_jax.train.evaluate import (
     VIEW,
@@ -42,7 +25,11 @@ from palm_jax.train.evaluate import (
     quoted,
     turned,
 )
-from palm_jax.train.metrics import write_json
+from palm_jax.train.files import locks, records
+from palm_jax.train.files.metrics import write_json
+from palm_jax.train.host import devices, interrupts
+from palm_jax.train.reporting import console as terminal
+from palm_jax.train.reporting import figures, films, videos
 
 Drawn = TypeVar("Drawn")
 

@@ -25,8 +25,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from palm_jax import wire
-from palm_jax.train import console as terminal
 from palm_jax.train.policy import IMAGE_SIZE, Decision, Policy, PolicyError, describe, load
+from palm_jax.train.reporting import console as terminal
 
 REQUIRED = ("image", "K", "cam_to_world", "tcp", "opening")
 """Entries of a request; `mask` besides for policies that isolate. Others are not looked at."""

@@ -23,8 +23,9 @@ from palm_jax.envs import registry, shifts
 from palm_jax.envs.base import Env, EnvParams, State
 from palm_jax.envs.rollout import Runner
 from palm_jax.envs.tasks import Stage
-from palm_jax.train import console as terminal
-from palm_jax.train import figures, methods
+from palm_jax.train import methods
+from palm_jax.train.reporting import console as terminal
+from palm_jax.train.reporting import figures
 
 T = TypeVar("T")
 

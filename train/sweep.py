@@ -25,21 +25,14 @@ from rich.console import Console
 from palm_jax.envs import registry, shifts
 from palm_jax.envs.base import EnvParams
 from palm_jax.envs.rollout import Episodes, repeat_params
-from palm_jax.train import (
-    checkpoint,
-    interrupts,
-    locks,
-    records,
-    report,
-    runs,
-    shards,
-    versions,
-    workspace,
-)
-from palm_jax.train import console as terminal
+from palm_jax.train import checkpoint, report, workspace
 from palm_jax.train.config import ConfigError
 from palm_jax.train.evaluate import Evaluator, Runners
+from palm_jax.train.files import locks, records, shards, versions
+from palm_jax.train.host import interrupts
 from palm_jax.train.learner import PolicyState
+from palm_jax.train.reporting import console as terminal
+from palm_jax.train.reporting import runs
 
 
 @dataclasses.dataclass(frozen=True)

@@ -31,21 +31,14 @@ from rich.console import Console
 
 from palm_jax.envs.registry import TASKS
 from palm_jax.envs.shifts import DOMAINS
-from palm_jax.train import (
-    compiled,
-    interrupts,
-    locks,
-    methods,
-    records,
-    shards,
-    table_page,
-    versions,
-    workspace,
-)
 from palm_jax.train import config as configuration
-from palm_jax.train import console as terminal
+from palm_jax.train import methods, workspace
 from palm_jax.train.config import Config, ConfigError
-from palm_jax.train.metrics import plain, write_json
+from palm_jax.train.files import locks, records, shards, versions
+from palm_jax.train.files.metrics import plain, write_json
+from palm_jax.train.host import compiled, interrupts
+from palm_jax.train.reporting import console as terminal
+from palm_jax.train.reporting import table_page
 
 _FIRST = ("palm", "bc")
 """Methods whose cells come first: the claim stands and falls with them."""

@@ -14,19 +14,12 @@ import jax
 from rich.console import Console
 
 from palm_jax.align import procedural_bank
-from palm_jax.train import (
-    checkpoint,
-    debug,
-    devices,
-    interrupts,
-    learner,
-    pictures,
-    records,
-    workspace,
-)
-from palm_jax.train import console as terminal
+from palm_jax.train import checkpoint, debug, learner, workspace
 from palm_jax.train.config import Learning
-from palm_jax.train.metrics import MetricsLog, write_json
+from palm_jax.train.files import pictures, records
+from palm_jax.train.files.metrics import MetricsLog, write_json
+from palm_jax.train.host import devices, interrupts
+from palm_jax.train.reporting import console as terminal
 
 PROMISE = "Stopping after this update, which saves; once more ends at once."
 LOG_EVERY = 25  # updates

@@ -21,11 +21,12 @@ import jax
 
 from palm_jax.envs import shifts
 from palm_jax.envs.registry import TASKS
-from palm_jax.train import checkpoint, methods, pictures, records, versions
+from palm_jax.train import checkpoint, methods
 from palm_jax.train.config import AnyConfig, Config, ConfigError, Learning, command
 from palm_jax.train.evaluate import VIEW, Evaluator, Runners
+from palm_jax.train.files import pictures, records, versions
+from palm_jax.train.files.metrics import write_json
 from palm_jax.train.learner import Learner, PolicyState, make_learner
-from palm_jax.train.metrics import write_json
 
 _FREE = ("out", "resume", "data", "calibration", "sweep", "videos", "method")
 """Fields in which a resumed command may differ from the one that began."""

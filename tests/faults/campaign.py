@@ -17,7 +17,7 @@ from faults import damaged_files, fuzz, kills, numerics, places, server
 from faults.cases import CASES, Case, Outcome, Skipped, identifier
 
 from palm_jax.train import workspace
-from palm_jax.train.metrics import write_atomic
+from palm_jax.train.files.metrics import write_atomic
 
 MODULES = (damaged_files, places, numerics, fuzz, server, kills)  # whose import registers the cases
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reliability.md"

@@ -22,18 +22,10 @@ from rich.console import Console
 
 from palm_jax.envs import make
 from palm_jax.envs.base import EnvParams
-from palm_jax.train import (
-    checkpoint,
-    demos,
-    metrics,
-    records,
-    run,
-    runs,
-    table,
-    training,
-    workspace,
-)
+from palm_jax.train import checkpoint, demos, run, table, training, workspace
 from palm_jax.train.config import Config, ConfigError
+from palm_jax.train.files import metrics, records
+from palm_jax.train.reporting import runs
 
 # -- checkpoints -----------------------------------------------------------------------------------
 

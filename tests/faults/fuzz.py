@@ -15,8 +15,9 @@ import numpy as np
 from faults import damaged_files
 from faults.cases import Outcome, case, snapshot
 
-from palm_jax.train import checkpoint, debug, demos, locks, records, table, workspace
+from palm_jax.train import checkpoint, debug, demos, table, workspace
 from palm_jax.train.config import ConfigError
+from palm_jax.train.files import locks, records
 
 SECONDS = 20.0  # of each reader, in the long campaign
 SHORT = 0.4

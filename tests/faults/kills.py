@@ -17,7 +17,10 @@ import play
 from faults import workers
 from faults.cases import Outcome, case, logged
 
-from palm_jax.train import checkpoint, interrupts, locks, records, table, table_page
+from palm_jax.train import checkpoint, table
+from palm_jax.train.files import locks, records
+from palm_jax.train.host import interrupts
+from palm_jax.train.reporting import table_page
 
 KILLS = 25
 _SERVER = multiprocessing.get_context("forkserver")

@@ -11,7 +11,8 @@ import rooms
 from faults.cases import Outcome, case, refused
 
 from palm_jax.envs.rollout import repeat_params
-from palm_jax.train import debug, evaluate, learner, records, sweep
+from palm_jax.train import debug, evaluate, learner, sweep
+from palm_jax.train.files import records
 
 POLICY: Any = None
 SIDE = 24

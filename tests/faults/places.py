@@ -16,7 +16,8 @@ from faults.damaged_files import TREE, _results, _saved
 
 from palm_jax.envs import make
 from palm_jax.envs.expert import Frames, Recording
-from palm_jax.train import checkpoint, demos, locks, metrics, records
+from palm_jax.train import checkpoint, demos
+from palm_jax.train.files import locks, metrics, records
 
 # -- full disk -------------------------------------------------------------------------------------
 

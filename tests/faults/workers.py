@@ -16,8 +16,9 @@ import numpy as np
 import play
 
 from palm_jax.train import __main__ as command
-from palm_jax.train import records, sweep, table
+from palm_jax.train import sweep, table
 from palm_jax.train.config import Config
+from palm_jax.train.files import records
 
 STEPS, EVERY = 100, 3
 OPTIONS = sweep.SweepConfig(run=Path(), camera="-30:30:6", workspace="4x5", episodes=1)

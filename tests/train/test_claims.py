@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from palm_jax.envs.shifts import DOMAINS
-from palm_jax.train import claims, paper
+from palm_jax.train.reporting import claims, paper
 
 METHODS = (
     "palm", "bc", "palm-crop", "palm-overlay", "palm-aug", "palm-prop", "mirrorduo", "roviaug",

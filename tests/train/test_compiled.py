@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from palm_jax.train import compiled, table
+from palm_jax.train import table
+from palm_jax.train.host import compiled
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import shlex
 import pytest
 from rich.console import Console
 
-from palm_jax.train import console as printing
+from palm_jax.train.reporting import console as printing
 
 
 class Clock:

@@ -20,7 +20,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from palm_jax.__main__ import main
 from palm_jax.train.data import calibration, output, verify
 from palm_jax.train.data.errors import DiskFullError
-from palm_jax.train.metrics import plain
+from palm_jax.train.files.metrics import plain
 
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
 Change = Callable[[h5py.File], None]

@@ -25,8 +25,9 @@ from faults import damaged_files
 from rich.console import Console
 
 from palm_jax.train import __main__ as training
-from palm_jax.train import checkpoint, devices, learner, methods, run, workspace
-from palm_jax.train.devices import DeviceError, Split, Together
+from palm_jax.train import checkpoint, learner, methods, run, workspace
+from palm_jax.train.host import devices
+from palm_jax.train.host.devices import DeviceError, Split, Together
 from palm_jax.train.training import Interrupted, Score, Training
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -16,8 +16,8 @@ from matplotlib.patches import Rectangle
 from PIL import Image
 from scipy import stats as scipy_stats
 
-from palm_jax.train import figures, grids
-from palm_jax.train.records import DomainRecord
+from palm_jax.train.files.records import DomainRecord
+from palm_jax.train.reporting import figures, grids
 
 REGIONS = grids.Regions()
 
@@ -296,7 +296,7 @@ def test_the_pairs_that_matter_stay_apart_without_red_green_vision(kind: str) ->
 
 
 def test_every_method_is_told_apart_by_more_than_colour() -> None:
-    from palm_jax.train.paper import METHODS
+    from palm_jax.train.reporting.paper import METHODS
 
     looks = [figures.look(method) for method in METHODS]
     assert len({look.colour for look in looks}) == len(METHODS)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palm_jax.align import AlignSpec
-from palm_jax.train import films
+from palm_jax.train.reporting import films
 
 WORLDS, STEPS = 4, 6
 SPEC = AlignSpec(crop=None, size=8)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from palm_jax.train import grids
-from palm_jax.train.records import DomainRecord, StrengthSweep, Sweep
+from palm_jax.train.files.records import DomainRecord, StrengthSweep, Sweep
+from palm_jax.train.reporting import grids
 
 REGIONS = grids.Regions()
 

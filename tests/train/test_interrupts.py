@@ -11,13 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from palm_jax.train import interrupts, locks
+from palm_jax.train.files import locks
+from palm_jax.train.host import interrupts
 
 ROOT = Path(__file__).resolve().parents[2]
 
 LISTENING = """
 import sys
-from palm_jax.train import interrupts
+from palm_jax.train.host import interrupts
 
 def work():
 {work}
@@ -187,7 +188,7 @@ def test_what_must_end_with_it_is_told(tmp_path: Path) -> None:
 
 AT_A_BARRIER = """
     import os, time
-    from palm_jax.train import devices
+    from palm_jax.train.host import devices
     devices.connect(os.environ["WHERE"])
     devices.wait()
     print("ready", flush=True)

@@ -12,13 +12,14 @@ from pathlib import Path
 import pytest
 
 from palm_jax.train import config as configuration
-from palm_jax.train import locks, run, workspace
+from palm_jax.train import run, workspace
 from palm_jax.train.__main__ import main
+from palm_jax.train.files import locks
 
 ROOT = Path(__file__).resolve().parents[2]
 HOLDER = """
 import sys
-from palm_jax.train import locks
+from palm_jax.train.files import locks
 with locks.claim(sys.argv[1]):
     print("held", flush=True)
     sys.stdin.readline()
@@ -70,7 +71,7 @@ def subprocess_claim(folder: Path) -> None:
     """Claims in a grandchild, whose parent holds nothing."""
     code = (
         "import subprocess, sys; sys.exit(subprocess.run([sys.executable, '-c', "
-        "'import sys\\nfrom palm_jax.train import locks\\n"
+        "'import sys\\nfrom palm_jax.train.files import locks\\n"
         "try:\\n with locks.claim(sys.argv[1]): pass\\n"
         "except locks.Busy: sys.exit(5)', sys.argv[1]]).returncode)"
     )

@@ -11,9 +11,10 @@ import rooms
 import tiny
 from rich.console import Console
 
-from palm_jax.train import demos, films, run
+from palm_jax.train import demos, run
 from palm_jax.train.__main__ import main
 from palm_jax.train.evaluate import VIEW
+from palm_jax.train.reporting import films
 
 FULL = "RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.\nBuffer assignment: ..."
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from palm_jax.train import metrics
-from palm_jax.train.metrics import MetricsLog, plain, read_metrics, write_json
+from palm_jax.train.files import metrics
+from palm_jax.train.files.metrics import MetricsLog, plain, read_metrics, write_json
 
 
 def lines(path: Path) -> list[str]:

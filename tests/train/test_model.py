@@ -21,7 +21,8 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from palm_jax.train import model, torch_files
+from palm_jax.train import model
+from palm_jax.train.files import torch as torch_files
 
 Array = np.ndarray
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from palm_jax.train import paper
+from palm_jax.train.reporting import paper
 
 TABLE = [
     "mirrorduo", "roviaug", "arro", "bc", "palm-crop", "palm-overlay", "palm-aug", "palm-prop",

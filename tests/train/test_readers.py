@@ -20,11 +20,13 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from palm_jax import wire
-from palm_jax.train import pictures, records, shards, torch_files, workspace
+from palm_jax.train import workspace
 from palm_jax.train.config import ConfigError
 from palm_jax.train.data import calibration
 from palm_jax.train.data.errors import CalibrationError, DataError
 from palm_jax.train.data.source import Source, open_source
+from palm_jax.train.files import pictures, records, shards
+from palm_jax.train.files import torch as torch_files
 
 bounded = settings(
     max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]

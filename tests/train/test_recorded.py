@@ -20,22 +20,14 @@ from scipy.spatial.transform import Rotation
 
 from palm_jax.align import AlignSpec, Camera
 from palm_jax.policy import Policy, load
-from palm_jax.train import (
-    checkpoint,
-    held_out,
-    learner,
-    methods,
-    metrics,
-    recorded,
-    report,
-    workspace,
-)
+from palm_jax.train import checkpoint, held_out, learner, methods, recorded, report, workspace
 from palm_jax.train import config as configuration
 from palm_jax.train.__main__ import main
 from palm_jax.train.config import ConfigError, Recorded
 from palm_jax.train.data import aligning, calibration
 from palm_jax.train.data.errors import FormatError
 from palm_jax.train.data.recording import open_recording
+from palm_jax.train.files import metrics
 
 TINY = ["--steps", "4", "--width", "2", "--batch-size", "4", "--image-size", "32",
         "--random-crop", "28", "--checkpoint-every", "2", "--overlay-warmup", "1"]  # fmt: skip

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palm_jax.train import records
+from palm_jax.train.files import records
 
 
 def values(n: int = 3) -> dict[str, Any]:

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palm_jax.train import figures, page, records, report, runs, videos
+from palm_jax.train import report
+from palm_jax.train.files import records
+from palm_jax.train.reporting import figures, page, runs, videos
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 

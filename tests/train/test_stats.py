@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats as scipy_stats
 
-from palm_jax.train.stats import (
+from palm_jax.train.reporting.stats import (
     degradation,
     degradation_interval,
     mean_interval,

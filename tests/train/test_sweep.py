@@ -13,9 +13,11 @@ import tiny
 
 from palm_jax.envs import make
 from palm_jax.envs.base import EnvParams
-from palm_jax.train import locks, records, runs, shards, sweep, versions
+from palm_jax.train import sweep
 from palm_jax.train.config import ConfigError
-from palm_jax.train.shards import ShardError
+from palm_jax.train.files import locks, records, shards, versions
+from palm_jax.train.files.shards import ShardError
+from palm_jax.train.reporting import runs
 from palm_jax.train.sweep import SweepConfig
 
 

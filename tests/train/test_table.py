@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 from palm_jax.train import config as configuration
-from palm_jax.train import locks, records, table, table_page
+from palm_jax.train import table
 from palm_jax.train.config import Config, ConfigError
+from palm_jax.train.files import locks, records
+from palm_jax.train.reporting import table_page
 from palm_jax.train.table import TableConfig
 
 SMALL = TableConfig(

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from palm_jax.envs.shifts import DOMAINS
-from palm_jax.train import config, records, table, table_page
+from palm_jax.train import config, table
+from palm_jax.train.files import records
+from palm_jax.train.reporting import table_page
 from palm_jax.train.table import TableConfig
 
 METHODS = ("palm", "bc")

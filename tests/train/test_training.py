@@ -19,17 +19,9 @@ import pytest
 from faults import damaged_files
 from PIL import Image
 
-from palm_jax.train import (
-    checkpoint,
-    demos,
-    locks,
-    metrics,
-    records,
-    sweep,
-    versions,
-    workspace,
-)
+from palm_jax.train import checkpoint, demos, sweep, workspace
 from palm_jax.train.__main__ import main
+from palm_jax.train.files import locks, metrics, records, versions
 
 STEPS, EVERY = 12, 4
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from palm_jax.train import versions
+from palm_jax.train.files import versions
 
 NOW = {"jax": "0.10.2", "mujoco-mjx": "3.17.0", "palm_jax": "0.1.0"}
 

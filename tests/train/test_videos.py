@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from palm_jax.train import videos
+from palm_jax.train.reporting import videos
 
 
 def ramp(height: int, width: int, shift: int = 0) -> np.ndarray:

@@ -51,7 +51,7 @@ from palm_jax.align.lens import LENGTHS
 from palm_jax.train.data import rotations
 from palm_jax.train.data.errors import CalibrationError, CameraNameError, ImageSizeError
 from palm_jax.train.data.headers import is_number
-from palm_jax.train.metrics import plain, write_json
+from palm_jax.train.files.metrics import plain, write_json
 
 FORMAT = "palm-calib/1"
 

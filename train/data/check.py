@@ -35,7 +35,7 @@ from palm_jax.train.data.recording import (
     projected,
 )
 from palm_jax.train.data.source import Source
-from palm_jax.train.metrics import write_atomic
+from palm_jax.train.files.metrics import write_atomic
 
 PANELS, COLUMNS, PANEL, CAPTION = 12, 4, 320, 22
 

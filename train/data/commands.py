@@ -29,8 +29,6 @@ from rich.table import Table
 
 from palm_jax._checks import OptionError
 from palm_jax.align import AlignSpec
-from palm_jax.train import console as terminal
-from palm_jax.train import interrupts, records
 from palm_jax.train.data import aligning, check, importers, inspection, job, soundness
 from palm_jax.train.data import calibration as calib
 from palm_jax.train.data.calibration import Calibration, CameraCalibration, RobotKeys
@@ -38,6 +36,9 @@ from palm_jax.train.data.errors import CalibrationError, DataError, OutputError,
 from palm_jax.train.data.headers import is_number
 from palm_jax.train.data.recording import LEAST_IN_VIEW, Recording, open_recording
 from palm_jax.train.data.source import Source, open_source
+from palm_jax.train.files import records
+from palm_jax.train.host import interrupts
+from palm_jax.train.reporting import console as terminal
 
 File = tyro.conf.Positional[Path]
 Flip = Literal["none", "ud", "lr", "180", "cw", "ccw"]

@@ -18,7 +18,6 @@ import h5py
 import mujoco
 import numpy as np
 
-from palm_jax.train import hdf5_files
 from palm_jax.train.data import rotations
 from palm_jax.train.data.calibration import (
     CameraCalibration,
@@ -36,6 +35,7 @@ from palm_jax.train.data.errors import (
 from palm_jax.train.data.recording import ambiguity
 from palm_jax.train.data.robomimic import open_hdf5, refuse
 from palm_jax.train.data.source import Source
+from palm_jax.train.files import hdf5 as hdf5_files
 
 Cameras = dict[str, CameraCalibration]
 Size = tuple[int, int]  # width, height

@@ -21,7 +21,7 @@ from palm_jax.train.data.lerobot_writer import ENCODINGS, LeRobotWriter
 from palm_jax.train.data.output import Partial, Writer
 from palm_jax.train.data.recording import LEAST_IN_VIEW, Recording, Survey, check_view
 from palm_jax.train.data.robomimic_writer import COMPRESSIONS, RobomimicWriter, writing
-from palm_jax.train.metrics import plain
+from palm_jax.train.files.metrics import plain
 
 KEEP = ("numbers", "all", "none")
 FORMATS = ("robomimic", "lerobot")

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from palm_jax.train import pictures
 from palm_jax.train.data import headers, video
 from palm_jax.train.data.errors import FormatError, KeyMissingError, TruncatedError
 from palm_jax.train.data.source import Feature, Source
+from palm_jax.train.files import pictures
 
 CODEBASE = "v3.0"
 

@@ -21,7 +21,7 @@ from palm_jax.train.data import output, video
 from palm_jax.train.data.errors import OutputError
 from palm_jax.train.data.lerobot import CODEBASE, LeRobotSource
 from palm_jax.train.data.source import Source
-from palm_jax.train.metrics import write_json
+from palm_jax.train.files.metrics import write_json
 
 ENCODINGS = ("png", *video.VideoWriter.ENCODERS)
 FILES_A_CHUNK = 1000

@@ -22,9 +22,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from palm_jax.train import locks
 from palm_jax.train.data.errors import DiskFullError, OutputError
-from palm_jax.train.metrics import fsync_folder, plain, write_json
+from palm_jax.train.files import locks
+from palm_jax.train.files.metrics import fsync_folder, plain, write_json
 
 RECIPE = "recipe.json"
 

@@ -20,10 +20,10 @@ from typing import Any
 import h5py
 import numpy as np
 
-from palm_jax.train import hdf5_files
 from palm_jax.train.data import headers
 from palm_jax.train.data.errors import FormatError, KeyMissingError, TruncatedError
 from palm_jax.train.data.source import Feature, Source
+from palm_jax.train.files import hdf5 as hdf5_files
 
 CACHE_BYTES = 64 * 2**20
 """For chunks that are not read past HDF5, and larger than a block or pieces of frames."""

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from palm_jax.train import grids, paper, records
+from palm_jax.train.files import records
+from palm_jax.train.reporting import grids, paper
 
 Counts = dict[str, dict[str, int]]  # domain -> successes, episodes, nan
 

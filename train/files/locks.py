@@ -26,7 +26,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from palm_jax.train.metrics import write_atomic
+from palm_jax.train.files.metrics import write_atomic
 
 CLAIM = ".claim"
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from palm_jax.train.records import DomainRecord, StrengthSweep, Sweep
+from palm_jax.train.files.records import DomainRecord, StrengthSweep, Sweep
 
 Array = NDArray[np.float64]
 

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from palm_jax.train.metrics import plain, read_metrics, write_atomic
+from palm_jax.train.files.metrics import plain, read_metrics, write_atomic
 
 HEADER = "header"
 """Name of the array with the conditions of a sweep, as JSON."""

@@ -25,7 +25,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from orbax.checkpoint import multihost
 
-from palm_jax.train import interrupts
+from palm_jax.train.host import interrupts
 
 AXIS = "data"
 AGREE_EVERY = 25  # updates between two agreements to stop; each costs all processes a round trip

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from palm_jax.train import paper
-from palm_jax.train.figures import look
-from palm_jax.train.metrics import write_atomic
+from palm_jax.train.files.metrics import write_atomic
+from palm_jax.train.reporting import paper
+from palm_jax.train.reporting.figures import look
 
 ImageArray = NDArray[np.uint8]
 

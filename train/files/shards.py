@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palm_jax.train import records
+from palm_jax.train.files import records
 
 FOLDER = "shards"
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from palm_jax.train import paper, stats
+from palm_jax.train.reporting import paper, stats
 
 Counts = Mapping[str, Mapping[str, int]]  # domain -> successes, episodes, nan
 Rows = Mapping[str, Mapping[str, Counts]]  # task -> method -> counts, seeds summed

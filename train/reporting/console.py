@@ -19,8 +19,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from palm_jax.train import paper
-from palm_jax.train.stats import degradation, success_rate, wilson_interval
+from palm_jax.train.reporting import paper
+from palm_jax.train.reporting.stats import degradation, success_rate, wilson_interval
 
 T = TypeVar("T")
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from palm_jax.train import console, figures, paper
-from palm_jax.train.runs import Counts
-from palm_jax.train.stats import (
+from palm_jax.train.reporting import console, figures, paper
+from palm_jax.train.reporting.runs import Counts
+from palm_jax.train.reporting.stats import (
     degradation,
     degradation_interval,
     mean_interval,

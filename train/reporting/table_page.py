@@ -5,10 +5,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from palm_jax.train import claims, config, figures, grids, paper, records, stats
-from palm_jax.train.metrics import write_atomic
-from palm_jax.train.records import DomainRecord, RecordError
-from palm_jax.train.runs import regions_of
+from palm_jax.train.files import records
+from palm_jax.train.files.metrics import write_atomic
+from palm_jax.train.files.records import DomainRecord, RecordError
+from palm_jax.train.reporting import claims, figures, grids, paper, stats
+from palm_jax.train.reporting.runs import regions_of
 
 Episodes = dict[str, dict[str, dict[str, DomainRecord]]]  # task -> method -> domain
 
@@ -222,10 +223,8 @@ def write(table_file: Path, page: Path) -> list[Path]:
     """
     table = records.load_json(table_file)
     preset = table["header"]["preset"]
-    if preset not in config.PRESETS:
-        raise RecordError(
-            f"{table_file}: preset {preset!r} is none; expected one of {config.PRESETS}"
-        )
+    if preset != records.file_word(preset):  # it becomes a folder's name and a comment's
+        raise RecordError(f"{table_file}: expected a preset's name, got {preset!r}")
     drawn = {
         task: draw(task, methods, page.parent / "images" / f"table_{preset}")
         for task, methods in load_episodes(episodes_file(table_file)).items()

@@ -1,0 +1,2 @@
+"""What came out, for people: lines on the terminal, figures, videos, pages, and the paper's numbers
+and claims beside ours."""
