@@ -6,7 +6,7 @@ import difflib
 import math
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import tyro
 
@@ -42,7 +42,8 @@ class Learning(abc.ABC):
       random_crop: side of the random crop in pixels (centre crop when acting).
       width: base width of the ResNet-18; the paper's is 64.
       norm: group or batch.
-      steps: updates.
+      steps: updates, if epochs is not given.
+      epochs: passes over the demonstrations: as many updates, whatever a method makes of them.
       batch_size: samples an update.
       learning_rate: of Adam, after the warm-up.
       schedule: cosine or constant.
@@ -72,6 +73,7 @@ class Learning(abc.ABC):
     width: int = 16
     norm: str = "group"
     steps: int = 2400
+    epochs: float | None = None
     batch_size: int = 32
     learning_rate: float = 1e-3
     schedule: str = "cosine"
@@ -84,6 +86,13 @@ class Learning(abc.ABC):
     backgrounds: Path | None = None
     checkpoint_every: int = 600
     keep: int = 3
+
+    def on(self, samples: int) -> Self:
+        """What this says of a training on so many demonstrated samples: `epochs` become `steps`."""
+        if self.epochs is None:
+            return self
+        steps = max(1, math.ceil(self.epochs * samples / self.batch_size))
+        return dataclasses.replace(self, steps=steps, epochs=None)
 
     def learner(self, method: methods.Method) -> LearnerConfig:
         """The learner's configuration for a method: the same for all, but for augmentation."""
@@ -115,6 +124,8 @@ class Learning(abc.ABC):
         for name in ("steps", "checkpoint_every", "keep"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if self.epochs is not None and not 0 < self.epochs < math.inf:
+            raise ConfigError(f"epochs: expected more than 0, got {self.epochs}")
         if self.random_crop > self.image_size:
             raise ConfigError(
                 f"random_crop: expected at most image_size = {self.image_size}, "
@@ -305,7 +316,7 @@ def cpu() -> Config:
         demos=200,
         image_size=84,
         random_crop=76,
-        steps=8000,
+        epochs=20.0,
         checkpoint_every=1600,
         select_from=0.6,
         select_scenes=50,
@@ -320,7 +331,7 @@ def paper() -> Config:
     """`python -m palm_jax.train --preset paper`: the paper's network and schedule; wants a GPU.
 
     Width 64 from scratch (no ImageNet weights are shipped, so the encoder's rate is not scaled
-    down), batch norm, Adam 1e-4 without schedule, batch 64, 600 epochs of about 10 000 frames.
+    down), batch norm, Adam 1e-4 without schedule, batch 64, 600 epochs.
     """
     return dataclasses.replace(
         Config(),
@@ -335,7 +346,7 @@ def paper() -> Config:
         schedule="constant",
         warmup_steps=0,
         ema=0.0,
-        steps=94_000,
+        epochs=600.0,
         checkpoint_every=7_800,
         select_from=0.0,
         select_scenes=50,
@@ -380,9 +391,15 @@ def _parsed(argv: Sequence[str], kind: type[AnyConfig]) -> AnyConfig:
             near = difflib.get_close_matches(option, fields, n=1)
             hint = f" (did you mean {near[0]}?)" if near else ""
             raise ConfigError(f"unknown option {option}{hint}; known: {', '.join(sorted(fields))}")
+    base = defaults(kind, name)
+    steps = any(word.split("=")[0] == "--steps" for word in argv)
+    if steps:  # instead of the preset's epochs
+        base = dataclasses.replace(base, epochs=None)
     config: AnyConfig = tyro.cli(
-        kind, args=list(argv), default=defaults(kind, name), prog="python -m palm_jax.train"
+        kind, args=list(argv), default=base, prog="python -m palm_jax.train"
     )
+    if steps and config.epochs is not None:
+        raise ConfigError(f"steps and epochs = {config.epochs}: give one of them")
     config.check()
     return config
 

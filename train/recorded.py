@@ -247,19 +247,22 @@ class _Job:
 
     def _train(self, console: Console) -> tuple[int, dict[str, Any]]:
         """The step of the checkpoint that was chosen, and how good it is."""
-        model = learner.make_learner(
-            self.config.learner(self.method), self.spec.proprio_size, (VIEW,)
-        )
         with self._aligned("train", self.split.train, console) as data:
+            config = self.config.on(len(data.proprio))
+            model = learner.make_learner(
+                config.learner(self.method), self.spec.proprio_size, (VIEW,)
+            )
             with self._aligned("check", self.split.held_out, console) as checked:
-                self._training(model, checked).train(data, console)
+                self._training(config, model, checked).train(data, console)
                 step, best = workspace.best_checkpoint(self.folder)
                 policy = model.policy_state(checkpoint.load(best, model.abstract_state()))
                 found = held_out.measure(model, policy, checked) if len(checked.proprio) else {}
             self._note_views(data)
         return step, found
 
-    def _training(self, model: learner.Learner, checked: learner.Batch) -> training.Training:
+    def _training(
+        self, config: Recorded, model: learner.Learner, checked: learner.Batch
+    ) -> training.Training:
         def score(step: int, state: learner.TrainState) -> training.Score:
             if not len(checked.proprio):
                 return training.Score(float(step), {})
@@ -270,7 +273,7 @@ class _Job:
             )
 
         return training.Training(
-            self.config, self.method.name, model, self.folder, score, self.method.augment
+            config, self.method.name, model, self.folder, score, self.method.augment
         )
 
     @contextmanager

@@ -88,11 +88,12 @@ def _execute(config: Config, out: Path, console: Console) -> Path:
         _worlds(config),
         tell=lambda text: console.print(text, style="bold", markup=False),
     )
+    data = _demonstrations(config, runners.first, console)
+    config = config.on(len(data.actions))
     # One for each method throughout: what it has compiled, it keeps.
     evaluators = {
         name: workspace.make_evaluator(config, methods.find(name), runners) for name in folders
     }
-    data = _demonstrations(config, runners.first, console)
     for name, folder in folders.items():
         workspace.bind_data(
             folder, workspace.DEMONSTRATIONS, data.digest, _demonstration_file(config)
@@ -127,6 +128,7 @@ def _take_part(config: Config) -> None:
         _demonstration_file(config), task=config.task, robot=config.robot, count=config.demos
     )
     _agree_on_data(config, data)
+    config = config.on(len(data.actions))
     for name in config.method:
         if devices.from_first(False):
             continue

@@ -46,7 +46,7 @@ _FIRST = ("palm", "bc")
 _POLL_S = 0.1  # how soon the end of a cell, and a signal, are noticed
 _KEPT = (
     "robot", "other_robot", "demos", "demo_seed", "demo_noise", "image_size", "random_crop",
-    "width", "norm", "steps", "batch_size", "learning_rate", "schedule", "warmup_steps",
+    "width", "norm", "steps", "epochs", "batch_size", "learning_rate", "schedule", "warmup_steps",
     "weight_decay", "ema", "overlay_warmup", "perspective", "turn", "select_from",
     "select_scenes", "checkpoint_every", "scenes", "eval_seed",
 )  # fmt: skip
@@ -167,6 +167,8 @@ def header(config: TableConfig) -> dict[str, Any]:
     preset = configuration.PRESETS[config.preset]()
     found = workspace.environment(preset)
     recipe = {name: getattr(preset, name) for name in _KEPT} | {"other_robot": preset.second_robot}
+    if preset.epochs is not None:
+        del recipe["steps"]  # of each task's own demonstrations
     return {
         "preset": config.preset,
         "recipe": plain(recipe),
@@ -355,14 +357,16 @@ def _note_demonstrations(
 
 
 def _took(times: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Seconds of training and of the evaluation, from a cell's times.json; None if one of them is
-    not known: a process that is killed after its results are written leaves no time for them."""
-    training, selection, evaluation = (
-        records.seconds(times, f"{name}_s")
-        for name in ("training_and_selection", "selection", "evaluation")
+    """Updates a second and the evaluation's seconds, from a cell's times.json; None if one of them
+    is not known: a process that is killed after its results are written leaves no time for them."""
+    updates, training, selection, evaluation = (
+        records.seconds(times, name)
+        for name in ("updates", "training_and_selection_s", "selection_s", "evaluation_s")
     )
-    training = None if training is None else training - (selection or 0.0)
-    return (training, evaluation) if training and training > 0 and evaluation is not None else None
+    if not updates or training is None or evaluation is None:
+        return None
+    training -= selection or 0.0
+    return (updates / training, evaluation) if training > 0 else None
 
 
 def _note_speed(table: dict[str, Any]) -> None:
@@ -371,9 +375,8 @@ def _note_speed(table: dict[str, Any]) -> None:
     took = list(filter(None, map(_took, every)))
     recipe, header = table["header"]["recipe"], table["header"]
     if took:
-        training, evaluation = map(statistics.median, zip(*took, strict=True))
-        samples = recipe["steps"] * recipe["batch_size"]
-        header["samples_per_second"] = round(samples / training, 1)
+        rate, evaluation = map(statistics.median, zip(*took, strict=True))
+        header["samples_per_second"] = round(rate * recipe["batch_size"], 1)
         header["evaluation_seconds"] = round(evaluation, 1)
 
 

@@ -22,6 +22,7 @@ from palm_jax.train.host import devices, interrupts
 from palm_jax.train.reporting import console as terminal
 
 PROMISE = "Stopping after this update, which saves; once more ends at once."
+TIMES = "times.json"
 LOG_EVERY = 25  # updates
 _BANK = 128  # background textures for Random Overlay
 
@@ -129,6 +130,7 @@ class Training:
                 )
         if together.agreed:
             raise Interrupted
+        note(self.folder, updates=config.steps)
 
     def _begun(self, console: Console) -> "_Begun | None":
         """Where the training goes on: the newest valid checkpoint, if there is one.
@@ -188,7 +190,10 @@ def timed(folder: Path, what: str) -> Iterator[None]:
     try:
         yield
     finally:
-        path = folder / "times.json"
-        times = dict(records.load_notes(path))
-        earlier = records.seconds(times, what) or 0.0
-        write_json(path, {**times, what: round(earlier + time.monotonic() - start, 2)})
+        earlier = records.seconds(records.load_notes(folder / TIMES), what) or 0.0
+        note(folder, **{what: round(earlier + time.monotonic() - start, 2)})
+
+
+def note(folder: Path, **values: float) -> None:
+    """Adds values to times.json, on which no result rests."""
+    write_json(folder / TIMES, {**records.load_notes(folder / TIMES), **values})

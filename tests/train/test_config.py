@@ -66,6 +66,7 @@ def test_options_override_the_preset() -> None:
         configs.cpu(),
         task="lift_spam",
         steps=7,
+        epochs=None,
         method=("bc",),
         domains=("in_domain", "viewpoint"),
         sweep=False,
@@ -81,6 +82,9 @@ def test_options_override_the_preset() -> None:
         ["--preset", "cpu", "--seed", "3"],
         ["--method", "palm", "--no-sweep", "--learning-rate", "3e-4"],
         ["--preset", "paper", "--task", "lift_spam", "--out", "with space/x", "--data", "d.hdf5"],
+        ["--preset", "cpu", "--steps", "9"],
+        ["--preset", "cpu", "--epochs", "None"],
+        ["--preset", "paper", "--epochs", "0.5"],
         ["--method", "bc", "palm-paper-frame", "--domains", "in_domain", "--weight-decay", "1e-6"],
     ],
 )
@@ -91,6 +95,13 @@ def test_a_command_gives_its_configuration_again(words: list[str]) -> None:
     assert parse(line[3:]) == config
     resumed = parse(command(config, resume=True)[3:])
     assert resumed == dataclasses.replace(config, resume=True)
+
+
+def test_epochs_become_steps() -> None:
+    config = dataclasses.replace(configs.quick(), epochs=2.5, batch_size=32)
+    assert config.on(100) == dataclasses.replace(config, steps=8, epochs=None)  # 7.8
+    assert config.on(1).steps == 1
+    assert configs.quick().on(100) == configs.quick()
 
 
 def test_folders_are_named_after_what_is_in_them() -> None:
@@ -122,6 +133,8 @@ def test_folders_are_named_after_what_is_in_them() -> None:
         (["--learning-rate", "-1"], "learning_rate is -1.0; expected 0 or more"),
         (["--stepps", "3"], r"unknown option --stepps \(did you mean --steps\?\); known: .*--task"),
         (["--steps", "0"], "steps: expected at least 1, got 0"),
+        (["--epochs", "0"], "epochs: expected more than 0, got 0.0"),
+        (["--steps", "9", "--epochs", "2"], "steps and epochs = 2.0: give one of them"),
         (["--scenes=-1"], "scenes: expected at least 1, got -1"),
         (
             ["--image-size", "50", "--random-crop", "51"],

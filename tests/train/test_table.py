@@ -23,7 +23,12 @@ SMALL = TableConfig(
     preset="quick", tasks=("lift_lid", "lift_spam"), methods=("arro", "bc", "palm"), seeds=(0, 1)
 )
 
-TIMES = {"training_and_selection_s": 30.0, "selection_s": 6.0, "evaluation_s": 10.0}
+TIMES = {
+    "updates": 2400,
+    "training_and_selection_s": 30.0,
+    "selection_s": 6.0,
+    "evaluation_s": 10.0,
+}
 
 
 class Trainer:
@@ -281,9 +286,11 @@ def test_the_header_tells_the_speed(tmp_path: Path, trainer: Trainer) -> None:
 @pytest.mark.parametrize(
     "left",
     [
-        '{"training_and_selection_s": 30.0, "selection_s": 6.0}',  # killed before the last number
-        '{"training_and_selection_s": 30.0, "evaluation_s": null}',
-        '{"training_and_selection_s": "30", "evaluation_s": 10.0}',
+        # killed before the last number
+        '{"updates": 2400, "training_and_selection_s": 30.0, "selection_s": 6.0}',
+        '{"updates": 2400, "training_and_selection_s": 30.0, "evaluation_s": null}',
+        '{"updates": 2400, "training_and_selection_s": "30", "evaluation_s": 10.0}',
+        '{"training_and_selection_s": 30.0, "evaluation_s": 10.0}',
         "{",
     ],
 )

@@ -5,6 +5,7 @@ Worlds and pictures are replaced (`play`); the rest is the command's own code.
 
 import contextlib
 import json
+import math
 import os
 import shutil
 import signal
@@ -72,6 +73,15 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert Command(out, patch)() == 0
     assert set(play.scores(out)) == {4, 8, 12}
     return out
+
+
+def test_epochs_are_passes_over_the_demonstrations(command: Command) -> None:
+    assert main(play.words(command.out, epochs=3, checkpoint_every=4)) == 0
+    with h5py.File(command.out.with_name("demos.hdf5")) as file:
+        frames = sum(len(demo["actions"]) for demo in file["data"].values())
+    updates = math.ceil(3 * frames / play.TINY["batch_size"])
+    assert max(step for step, _ in checkpoint.steps(command.out / "checkpoints")) == updates
+    assert json.loads((command.out / "times.json").read_text())["updates"] == updates
 
 
 @pytest.mark.parametrize("step", ["5", "8", "11"])

@@ -64,12 +64,19 @@ def _conditions(header: Mapping[str, Any]) -> str:
     recipe = header["recipe"]
     versions = ", ".join(f"{name} {version}" for name, version in header["versions"].items())
     return (
-        f"{recipe['demos']} demonstrations of the {recipe['robot']} a task, {recipe['steps']} "
-        f"updates of {recipe['batch_size']} samples, {recipe['image_size']}-pixel images, width "
+        f"{recipe['demos']} demonstrations of the {recipe['robot']} a task, {_length(recipe)} of "
+        f"{recipe['batch_size']} samples, {recipe['image_size']}-pixel images, width "
         f"{recipe['width']}, {recipe['scenes']} scenes a domain, the same for every method; in "
         f"domains with E the {recipe['other_robot']} acts. {header['machine']}; {versions}; commit "
         f"{header['commit']}."
     )
+
+
+def _length(recipe: Mapping[str, Any]) -> str:
+    """How long policies are trained."""
+    if recipe.get("epochs") is None:
+        return f"{recipe['steps']} updates"
+    return f"{recipe['epochs']:g} passes over them in updates"
 
 
 def _means(rows: claims.Rows) -> str:
