@@ -35,7 +35,7 @@ def test_the_papers_numbers() -> None:
     config = PRESETS["paper"]()
     assert (config.width, config.norm, config.batch_size, config.scenes) == (64, "batch", 64, 50)
     assert (config.learning_rate, config.schedule) == (1e-4, "constant")
-    assert config.steps == pytest.approx(600 * 10_000 / 64, rel=0.01)
+    assert config.on(10_000).steps == 600 * 10_000 / 64
 
 
 def test_the_other_robot_is_another_one() -> None:
