@@ -43,6 +43,8 @@ from palm_jax.train.files.metrics import fsync_folder, plain, write_atomic
 
 FORMAT = "palm_jax.checkpoint"
 VERSION = 1
+_LOOKS = 5  # so often in a row what a failed save has left must be gone...
+_CLEARING_S = 5.0  # ...within this time
 MANIFEST = "manifest.json"
 ARRAYS = "arrays"
 DAMAGED = "damaged"
@@ -177,11 +179,11 @@ def save(
 def _clear(temporary: Path) -> None:
     """Delete what a failed save has written. Orbax raises with its first write that fails, while
     threads of it finish theirs and make the folder anew: gone is what stays away for a while."""
-    absent, end = 0, time.monotonic() + 5.0
-    while absent < 5 and time.monotonic() < end:
+    looks, end = 0, time.monotonic() + _CLEARING_S
+    while looks < _LOOKS and time.monotonic() < end:
         shutil.rmtree(temporary, ignore_errors=True)
         time.sleep(0.05)
-        absent = 0 if temporary.exists() else absent + 1
+        looks = 0 if temporary.exists() else looks + 1
 
 
 def _write_arrays(path: Path, named: Mapping[str, Any]) -> None:

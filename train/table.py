@@ -313,7 +313,7 @@ def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
     _keep_episodes(config.file, {cell: records.load_eval(folder / "eval.npz")})
     _put(table, "results", cell, records.load_counts(folder / "eval.json"))
     _drop(table, "failed", cell)
-    times = records.load_notes(folder / "times.json")
+    times = records.load_notes(folder / records.TIMES)
     if _took(times):
         _put(table, "times", cell, times)
     _note_speed(table)

@@ -22,7 +22,6 @@ from palm_jax.train.host import devices, interrupts
 from palm_jax.train.reporting import console as terminal
 
 PROMISE = "Stopping after this update, which saves; once more ends at once."
-TIMES = "times.json"
 LOG_EVERY = 25  # updates
 _BANK = 128  # background textures for Random Overlay
 
@@ -190,10 +189,11 @@ def timed(folder: Path, what: str) -> Iterator[None]:
     try:
         yield
     finally:
-        earlier = records.seconds(records.load_notes(folder / TIMES), what) or 0.0
+        earlier = records.seconds(records.load_notes(folder / records.TIMES), what) or 0.0
         note(folder, **{what: round(earlier + time.monotonic() - start, 2)})
 
 
 def note(folder: Path, **values: float) -> None:
     """Adds values to times.json, on which no result rests."""
-    write_json(folder / TIMES, {**records.load_notes(folder / TIMES), **values})
+    path = folder / records.TIMES
+    write_json(path, {**records.load_notes(path), **values})

@@ -31,6 +31,7 @@ from palm_jax.train.files.metrics import plain, read_metrics, write_atomic
 HEADER = "header"
 """Name of the array with the conditions of a sweep, as JSON."""
 
+TIMES = "times.json"  # seconds, and updates: no result rests on it
 HELD_OUT = "held_out.json"
 """Of a run on recordings: figures on the episodes that were held out (`train.held_out`)."""
 

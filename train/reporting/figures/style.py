@@ -109,6 +109,7 @@ def save(figure: Figure, path: Path, *, dpi: int = 160) -> Path:
 
 
 def percent_axis(axes: Axes, *, label: str = "success", top: float = 1.04) -> None:
+    """A y axis for shares from 0 to 1, in percent."""
     axes.set_ylim(0, top)
     axes.set_yticks(np.linspace(0, 1, 6), [f"{value:.0f}" for value in np.linspace(0, 100, 6)])
     axes.set_ylabel(f"{label} (%)")
@@ -137,12 +138,14 @@ def map_axes(axes: Axes, *, left: bool, bottom: bool = True) -> None:
 
 
 def only_text(message: str) -> Figure:
+    """A small figure that says why there is no other."""
     figure = Figure(figsize=(5.0, 1.2))
     figure.text(0.5, 0.5, message, ha="center", va="center", color=MUTED)
     return figure
 
 
 def degree_label(value: float) -> str:
+    """An angle in degrees as on an axis: with its sign, in whole degrees."""
     return f"{value:+.0f}°".replace("-", "−") if abs(value) > 0.5 else "0°"
 
 
