@@ -234,6 +234,22 @@ def load(path: Path, *, task: str, robot: str, count: int | None = None) -> Demo
         ) from error
 
 
+def collected_with(path: Path) -> dict[str, Any]:
+    """`seed` and `noise` (metres) that a file was collected with; None where it does not say.
+
+    Raises:
+      DemoFileError: it is no file of demonstrations.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            attributes = dict(file["data"].attrs)
+    except (OSError, KeyError, RuntimeError) as error:
+        raise DemoFileError(
+            f"{path} is not a whole demonstration file ({error}); move it away and collect again"
+        ) from error
+    return {name: np.asarray(attributes.get(name)).item() for name in ("seed", "noise")}
+
+
 def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None) -> Demos:
     expected = {"format": FORMAT, "version": VERSION, "task": task, "robot": robot}
     for name, value in expected.items():

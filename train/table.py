@@ -6,11 +6,13 @@ costs that cell alone, and a second call goes on where the first one ended. Demo
 once for each task. Finished cells go into one JSON file at once:
 
     {"header": {...}, "results": {task: {method: {seed: {domain: {"successes", "episodes",
-    "nan"}}}}}, "failed": {task: {method: {seed: log}}}}
+    "nan"}}}}}, "failed": {task: {method: {seed: log}}}, "times": {...}, "demonstrations": {...}}
 
-The header says under which conditions; a file with another one is not touched. The episodes one by
-one lie in an .npz file beside it, laid out like eval.npz with TASK/METHOD/SEED/DOMAIN for names.
-`--page` makes Markdown and figures of the two.
+The header says under which conditions; a file with another one is not touched. `demonstrations` has
+the SHA-256 of what each policy was trained on, `times` how long it took, both laid out alike. The
+episodes one by one lie in an .npz file beside it, laid out like eval.npz with
+TASK/METHOD/SEED/DOMAIN for names. `--page` makes Markdown and figures of the
+two.
 """
 
 import dataclasses
@@ -32,7 +34,7 @@ from rich.console import Console
 from palm_jax.envs.registry import TASKS
 from palm_jax.envs.shifts import DOMAINS
 from palm_jax.train import config as configuration
-from palm_jax.train import methods, workspace
+from palm_jax.train import demos, methods, workspace
 from palm_jax.train.config import Config, ConfigError
 from palm_jax.train.files import locks, records, shards, versions
 from palm_jax.train.files.metrics import plain, write_json
@@ -281,7 +283,9 @@ def _run_cell(
     """Trains a cell that is claimed, and enters what came of it into the file."""
     start = time.monotonic()
     log = config.folder / f"{cell.name}.log"
-    code = _train(cell_config(config, cell), log)
+    command = cell_config(config, cell)
+    _check_demonstrations(command)
+    code = _train(command, log)
     with locks.locked(config.file):  # another process may write beside us
         table = read(config.file, fresh)
         if code == 0 and _whole(config.folder / cell.name, console):
@@ -309,13 +313,14 @@ def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
     """What a finished cell left in its folder, into the table and the file beside it."""
     folder = config.folder / cell.name
     _check_versions(table["header"], folder)
-    _note_demonstrations(table["header"], {cell.task: _trained_on(folder)}, folder)
     _keep_episodes(config.file, {cell: records.load_eval(folder / "eval.npz")})
     _put(table, "results", cell, records.load_counts(folder / "eval.json"))
     _drop(table, "failed", cell)
     times = records.load_notes(folder / records.TIMES)
     if _took(times):
         _put(table, "times", cell, times)
+    if (digest := _trained_on(folder)) is not None:
+        _put(table, workspace.DEMONSTRATIONS, cell, digest)
     _note_speed(table)
 
 
@@ -333,26 +338,28 @@ def _check_versions(header: Mapping[str, Any], folder: Path) -> None:
 
 
 def _trained_on(folder: Path) -> str | None:
-    """SHA-256 of a cell's demonstrations; None if nothing of it was noted."""
+    """SHA-256 of a cell's demonstrations; None from a version that did not note it."""
     digests = records.load_notes(folder / "config.json").get(workspace.DIGESTS)
     return digests.get(workspace.DEMONSTRATIONS) if isinstance(digests, dict) else None
 
 
-def _note_demonstrations(
-    header: dict[str, Any], found: Mapping[str, str | None], where: Path
-) -> None:
-    """Adds the SHA-256 of tasks' demonstrations to a header.
+def _check_demonstrations(config: Config) -> None:
+    """Raises ConfigError for a file in OUT/demos that was not collected as the recipe says.
 
-    Raises:
-      ConfigError: it has others; the task is named.
-    """
-    known = header.setdefault(workspace.DEMONSTRATIONS, {})
-    for task, digest in found.items():
-        if digest is not None and known.setdefault(task, digest) != digest:
+    Its seed and disturbance are compared, not its digest: two kinds of processor round differently,
+    and a machine that goes on with a table collects the same scenes, but not the same bits."""
+    assert config.data is not None
+    if not config.data.exists():
+        return
+    try:
+        found = demos.collected_with(config.data)
+    except demos.DemoFileError:
+        return  # the cell fails with the same words in its log, and others go on
+    for name, value in {"seed": config.demo_seed, "noise": config.demo_noise}.items():
+        if found[name] != value:
             raise ConfigError(
-                f"{where}: demonstrations of {task} with SHA-256 {digest[:12]}, but the table was "
-                f"begun with {known[task][:12]}: results of two kinds are not mixed. Give all "
-                "shards the same OUT/demos, or choose another --json and --out"
+                f"{config.data} was collected with {name} {found[name]}, the table's recipe says "
+                f"{value}: move it away, or choose another --out"
             )
 
 
@@ -474,14 +481,14 @@ def _merge(
         )
     other, beside = read(path, fresh), _episodes_of(path)
     taken: dict[Cell, Mapping[str, records.DomainRecord]] = {}
-    demonstrations = other["header"].get(workspace.DEMONSTRATIONS, {})
-    _note_demonstrations(table["header"], demonstrations, path)
     for cell in _cells_of(other, "results"):
         if _get(table, "results", cell) is None:
             counts = _get(other, "results", cell)
             records.compare_counts(f"{path}: {cell.name}", counts, beside.get(cell, {}))
             _put(table, "results", cell, counts)
-            _put(table, "times", cell, _get(other, "times", cell) or {})
+            for part in ("times", workspace.DEMONSTRATIONS):
+                if (value := _get(other, part, cell)) is not None:
+                    _put(table, part, cell, value)
             _drop(table, "failed", cell)
             taken[cell] = beside.get(cell, {})
     for cell in _cells_of(other, "failed"):

@@ -9,6 +9,7 @@ import time
 from importlib import metadata
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -233,30 +234,46 @@ def test_what_cannot_be_merged_is_named_and_changes_nothing(
     assert len(records.load_eval(table_page.episodes_file(first.file))) == 4
 
 
-def test_cells_of_other_demonstrations_are_not_mixed(
-    tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Neither in a file, nor when files are merged."""
+def test_every_cell_notes_its_demonstrations(tmp_path: Path, trainer: Trainer) -> None:
+    """Machines round differently: a table that another one goes on with has two collections."""
     config = dataclasses.replace(SMALL, out=tmp_path / "one", seeds=(0,), methods=("palm",))
     assert run(config) == 0  # by a version that did not note them
-    assert json.loads(config.file.read_text())["header"]["demonstrations"] == {}
+    assert "demonstrations" not in json.loads(config.file.read_text())
     trainer.demonstrations = {"lift_lid": "a" * 64, "lift_spam": "b" * 64}
     assert run(dataclasses.replace(config, methods=("bc",))) == 0
-    header = json.loads(config.file.read_text())["header"]
-    assert header["demonstrations"] == trainer.demonstrations
-    before = config.file.read_bytes(), table_page.episodes_file(config.file).read_bytes()
     trainer.demonstrations["lift_spam"] = "c" * 64
-    assert run(dataclasses.replace(config, tasks=("lift_spam",), methods=("arro",))) == 2
-    error = " ".join(capsys.readouterr().err.split())
-    assert "demonstrations of lift_spam with SHA-256 cccccccccccc" in error
-    assert "begun with bbbbbbbbbbbb" in error
     other = dataclasses.replace(config, out=tmp_path / "two", methods=("arro",))
     assert run(other) == 0
-    assert run(dataclasses.replace(config, merge=(other.file,))) == 2
+    assert run(dataclasses.replace(config, merge=(other.file,))) == 0
+    content = json.loads(config.file.read_text())
+    assert set(content["results"]["lift_lid"]) == {"palm", "bc", "arro"}
+    assert content["demonstrations"] == {
+        "lift_lid": {"bc": {"0": "a" * 64}, "arro": {"0": "a" * 64}},
+        "lift_spam": {"bc": {"0": "b" * 64}, "arro": {"0": "c" * 64}},
+    }
+
+
+@pytest.mark.parametrize(("name", "value"), [("noise", 0.01), ("seed", 5)])
+def test_demonstrations_of_another_recipe_are_refused(
+    name: str, value: float, tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = dataclasses.replace(SMALL, out=tmp_path, seeds=(0,), methods=("palm",))
+    path = tmp_path / "demos" / "lift_spam.hdf5"
+    path.parent.mkdir()
+    recipe = configuration.PRESETS[config.preset]()
+    with h5py.File(path, "w") as file:
+        attributes = {"seed": recipe.demo_seed, "noise": recipe.demo_noise}
+        file.create_group("data").attrs.update({**attributes, name: value})
+    assert run(config) == 2
+    assert trainer.asked == ["lift_lid/palm-s0"]
     error = " ".join(capsys.readouterr().err.split())
-    assert f"{other.file}: demonstrations of lift_spam with SHA-256 cccccccccccc" in error
-    after = config.file.read_bytes(), table_page.episodes_file(config.file).read_bytes()
-    assert after == before
+    assert f"{path} was collected with {name} {value}, the table's recipe says" in error
+    with h5py.File(path, "a") as file:
+        file["data"].attrs.update(attributes)
+    assert run(config) == 0
+    path.write_bytes(b"no HDF5")  # is told by the command itself, which fails alone
+    assert run(dataclasses.replace(config, methods=("bc",))) == 0
+    assert trainer.asked[-1] == "lift_spam/bc-s0"
 
 
 @pytest.mark.parametrize("kind", ["one of the sessions", "the only one"])

@@ -43,6 +43,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             row[seed] = records.counts(found)
             episodes |= {f"{task}/{method}/{seed}/{domain}": r for domain, r in found.items()}
     content["failed"] = {"lift_lid": {"arro": {"0": "arro.log"}}}
+    content["demonstrations"] = {
+        "lift_lid": {"palm": {"0": "a" * 64, "1": "b" * 64}, "bc": {"0": "a" * 64}},
+        "insert_peg": {"palm": {"0": "c" * 64, "1": "c" * 64}},
+    }
     path = folder / "table.json"
     path.write_text(json.dumps(content))
     records.save_eval(table_page.episodes_file(path), episodes)
@@ -89,6 +93,10 @@ def test_the_command_beside_a_policy_is_its_own(page: str) -> None:
 def test_what_was_not_run_is_said(page: str) -> None:
     line = next(line for line in page.splitlines() if line.startswith("Not complete: "))
     assert "PALM (Lift Spam, Rearrange Veggies)" in line and "ARRO (every task)" in line
+
+
+def test_collections_of_several_machines_are_counted(page: str) -> None:
+    assert "there are 2 collections of Lift Lid. The JSON" in page
 
 
 def test_what_failed_is_said(page: str) -> None:

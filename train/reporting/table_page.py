@@ -79,6 +79,16 @@ def _length(recipe: Mapping[str, Any]) -> str:
     return f"{recipe['epochs']:g} passes over them in updates"
 
 
+def _collections(table: Mapping[str, Any]) -> list[str]:
+    """Tasks whose cells were not all trained on the same bits, in words."""
+    found = []
+    for task, row in table.get("demonstrations", {}).items():
+        digests = {digest for seeds in row.values() for digest in seeds.values()}
+        if len(digests) > 1:
+            found.append(f"{len(digests)} collections of {_cell(paper.task_label(task))}")
+    return found
+
+
 def _means(rows: claims.Rows) -> str:
     """Ours above the paper's, a pair of lines for each method that every task has."""
     posterior, body = claims.Posterior(rows), []
@@ -165,7 +175,14 @@ def text(table: Mapping[str, Any], drawn: Mapping[str, Sequence[str]]) -> str:
     rows, header = rows_of(table), table["header"]
     parts = [f"## The main table, preset `{header['preset']}`", _cell(_conditions(header))]
     parts += ["### Means over the tasks", _means(rows), "### The claims", _claims(rows)]
-    missing, failed = _missing(table), list(_failed(table))
+    missing, failed, collections = _missing(table), list(_failed(table)), _collections(table)
+    if collections:
+        parts.insert(
+            2,
+            "A task's demonstrations have the same scenes and disturbances throughout, but were "
+            "collected anew on each machine, and processors round differently: there are "
+            f"{' and '.join(collections)}. The JSON file has the SHA-256 of what each policy saw.",
+        )
     if missing:
         parts.insert(1, f"Not complete: {'; '.join(missing)} not run yet.")
     if failed:
