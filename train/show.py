@@ -4,7 +4,8 @@
 * `robots.png`: every robot from several sides, and as a policy sees its hand;
 * `TASK.png`: the expert's episode on every robot, with the moments before each change of stage;
 * `axes.png`: each single shift from its least to its greatest strength, for one task;
-* `methods.png`: what every method sees of that task's scene, under some of the domains.
+* `methods.png`: what every method sees of that task's scene, in all of the paper's domains; in those
+  with another robot the second of those asked for.
 """
 
 import dataclasses
@@ -28,6 +29,8 @@ from palm_jax.train.reporting import console as terminal
 from palm_jax.train.reporting import figures
 
 T = TypeVar("T")
+Seen = dict[str, list[figures.ImageArray]]
+"""Who sees a scene -> a picture for each domain."""
 
 DOMAINS = (
     "in_domain",
@@ -45,6 +48,15 @@ DOMAINS = (
 STRENGTHS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 _CALIBRATION = "calibration"  # axes that begin so change what a policy sees, not what a camera does
 _WINDOW = 84
+
+_SEEN = (
+    ("in_domain", "workspace", "viewpoint", "workspace+viewpoint"),
+    (
+        "embodiment", "workspace+embodiment", "viewpoint+embodiment",
+        "workspace+viewpoint+embodiment",
+    ),
+)  # fmt: skip
+"""Columns of `methods.png`: with the first robot, with the second."""
 
 VIEWS = {
     "from the front": ((1.3, 0.1, 1.45), (0.0, 0.0, 1.05)),
@@ -257,6 +269,7 @@ def show(config: ShowConfig, console: terminal.Console) -> list[Path]:
     starts: list[list[figures.ImageArray | None]] = []
     files: list[Path] = []
     portraits: dict[str, list[figures.ImageArray]] = {}
+    seen: dict[str, Seen] = {}
     total = len(config.tasks) * len(config.robots) + 1
     with terminal.ProgressBar(console, total, "pictures", unit="world") as bar:
         for task in config.tasks:
@@ -270,12 +283,15 @@ def show(config: ShowConfig, console: terminal.Console) -> list[Path]:
                 strips[robot] = studio.expert(config.seed)
                 if robot not in portraits:
                     portraits[robot] = studio.portraits(config.seed)
-                if not files and robot == config.robots[0]:
-                    files += [_axes(studio, config), _methods(studio, config)]
+                if task == config.tasks[0] and len(seen) < len(_SEEN):
+                    seen[robot] = _seen(studio, config.seed, _SEEN[len(seen)])
+                if not files:
+                    files.append(_axes(studio, config))
                     bar.advance()
                 studio.close()
                 bar.advance()
             files.append(_episodes(task, strips, config.out))
+    files.append(_methods(seen, config.tasks[0], config.out))
     columns = [_words(domain) for domain in config.domains]
     title = "One scene of every task on every robot, under shifts at full strength"
     figure = figures.picture_grid(starts, rows, columns, title=title)
@@ -332,29 +348,33 @@ def _axes(studio: Studio, config: ShowConfig) -> Path:
     return figures.save(figure, config.out / "axes.png")
 
 
-_SEEN = ("in_domain", "workspace", "viewpoint", "workspace+viewpoint")
-"""Columns of `methods.png`."""
-
-
-def _methods(studio: Studio, config: ShowConfig) -> Path:
-    """`methods.png`: one scene of one task as methods see it; who sees the same shares a row."""
+def _seen(studio: Studio, seed: int, domains: Sequence[str]) -> Seen:
+    """One scene as the camera and all methods see it; methods that see the same share an entry."""
     default, task = studio.env.default_params(), studio.env.task
-    params = [shifts.shifted(default, domain) for domain in _SEEN]
-    rows: dict[tuple[AlignSpec, int], list[methods.Method]] = {}
+    params = [shifts.shifted(default, domain) for domain in domains]
+    alike: dict[tuple[AlignSpec, int], list[methods.Method]] = {}
     for method in methods.METHODS.values():
         # How the rest of the input looks does not show.
         spec = dataclasses.replace(method.spec(task, _WINDOW), layout="z")
-        rows.setdefault((spec, method.frame), []).append(method)
-    pictures: list[list[figures.ImageArray | None]] = [[*studio.starts(config.seed, params)]]
-    pictures += [[*studio.starts(config.seed, params, seen_by=row[0])] for row in rows.values()]
-    names = ["the camera", *("\n".join(method.name for method in row) for row in rows.values())]
-    figure = figures.picture_grid(
-        pictures,
-        names,
-        [_words(domain) for domain in _SEEN],
-        title=f"What methods see: one scene of {_words(task.name)}, {studio.env.robot.name}",
-    )
-    return figures.save(figure, config.out / "methods.png")
+        alike.setdefault((spec, method.frame), []).append(method)
+    seen = {"the camera": studio.starts(seed, params)}
+    for row in alike.values():
+        name = "\n".join(method.name for method in row)
+        seen[name] = studio.starts(seed, params, seen_by=row[0])
+    return seen
+
+
+def _methods(seen: Mapping[str, Seen], task: str, out: Path) -> Path:
+    """`methods.png`, from what is seen with the first robot and, if there is one, the second."""
+    columns: list[str] = []
+    rows: dict[str, list[figures.ImageArray | None]] = {}
+    for domains, (robot, by_row) in zip(_SEEN, seen.items(), strict=False):
+        columns += [f"{_words(domain)}\n({robot})" for domain in domains]
+        for name, pictures in by_row.items():
+            rows.setdefault(name, []).extend(pictures)
+    title = f"What methods see: one scene of {_words(task)}"
+    figure = figures.picture_grid(list(rows.values()), list(rows), columns, title=title)
+    return figures.save(figure, out / "methods.png")
 
 
 def _words(name: str) -> str:

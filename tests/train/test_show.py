@@ -105,4 +105,5 @@ def test_files(
     assert counts["worlds.png"][[167, 200]].min() > 2 * cell
     assert counts["robots.png"][110] > 2 * len(show.VIEWS) * cell
     assert counts["axes.png"][133] > cell and counts["axes.png"][200] > cell
+    assert counts["methods.png"][167] > 8 * 7 * cell  # the paper's domains, methods and the camera
     assert counts["lift_lid.png"][[50, 90, 130]].min() > 2 * cell
