@@ -4,8 +4,8 @@
 * `robots.png`: every robot from several sides, and as a policy sees its hand;
 * `TASK.png`: the expert's episode on every robot, with the moments before each change of stage;
 * `axes.png`: each single shift from its least to its greatest strength, for one task;
-* `methods.png`: what every method sees of that task's scene, in all of the paper's domains; in those
-  with another robot the second of those asked for.
+* `methods.png`: what every method sees of that task's scene in each of the paper's domains, those
+  with another robot on the second of the robots.
 """
 
 import dataclasses

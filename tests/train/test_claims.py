@@ -76,6 +76,34 @@ def test_a_task_that_is_not_learned_is_left_out_of_the_losses_alone() -> None:
     assert posterior.loss("bc", "W")[0] == pytest.approx(0.40, abs=0.02)
 
 
+def test_two_methods_are_compared_on_tasks_that_both_can_do() -> None:
+    rows = as_in_the_paper(100)
+    for entry in rows["task1"]["bc"].values():
+        entry["successes"] = 0
+    for domain, entry in rows["task1"]["palm"].items():  # of which PALM's loss is a half
+        entry["successes"] = 80 if domain == "in_domain" else 40
+    posterior = claims.Posterior(rows)
+    bc, palm, alone = (
+        posterior.loss("bc", "W")[0],
+        posterior.loss("palm", "W", tasks=["task0"])[0],
+        posterior.loss("palm", "W", tasks=["task1"])[0],
+    )
+    assert alone == pytest.approx(0.5) and palm < 0.1
+    value, draws = posterior.gap("bc", "palm", "W")
+    assert value == pytest.approx(bc - palm) and np.median(draws) == pytest.approx(value, abs=0.02)
+    assert posterior.gap("palm", "bc", "W")[0] == pytest.approx(-value)
+    assert posterior.gap("palm", "palm-crop", "W")[0] == pytest.approx(
+        posterior.loss("palm", "W")[0] - posterior.loss("palm-crop", "W")[0]
+    )
+
+
+def test_where_no_task_is_shared_nothing_is_decided() -> None:
+    rows = as_in_the_paper(100, tasks=1)
+    for entry in rows["task0"]["bc"].values():
+        entry["successes"] = 0
+    assert verdicts(rows)["C1"] == "undecided" == verdicts(rows)["C6"]
+
+
 def test_seeds_are_summed() -> None:
     one = {"in_domain": {"successes": 3, "episodes": 10, "nan": 1}}
     two = {"in_domain": {"successes": 4, "episodes": 10, "nan": 0}}

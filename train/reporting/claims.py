@@ -3,7 +3,8 @@
 Every question is a difference (or several) that the claim says is positive. Success rates have
 Beta posteriors under Jeffreys' prior, independent over cells; a claim holds when the central 95 %
 of every difference lies above zero, does not when that of any lies below, and is undecided
-otherwise. Scenes are what is resampled: the spread between training seeds is not in it.
+otherwise. Losses of two methods are compared on the tasks that both of them can do. Scenes are what
+is resampled: the spread between training seeds is not in it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +21,6 @@ LEAST_IN_DOMAIN = 0.1
 """A policy that solves less in-domain has nothing to lose: that task is left out of its losses."""
 
 _DRAWS = 4000
-_AXES = ("W", "V", "E")
 
 
 class Estimate(NamedTuple):
@@ -69,15 +69,25 @@ class Posterior:
         """In-domain success, mean over all tasks: value, draws [D]."""
         return _mean([self._rate(task, method, "ID") for task in self._rows])
 
-    def loss(self, method: str, *keys: str) -> tuple[float, np.ndarray]:
-        """1 - success / in-domain success, mean over domains (keys as in `paper`) and tasks."""
+    def loss(
+        self, method: str, *keys: str, tasks: Sequence[str] | None = None
+    ) -> tuple[float, np.ndarray]:
+        """1 - success / in-domain success, mean over domains (keys as in `paper`) and tasks: those
+        of `tasks(method)` by default."""
         parts = []
-        for task in self.tasks(method):
+        for task in self.tasks(method) if tasks is None else tasks:
             base, base_draws = self._rate(task, method, "ID")
             for key in keys:
                 rate, draws = self._rate(task, method, key)
                 parts.append((1 - rate / base, 1 - draws / base_draws))
         return _mean(parts)
+
+    def gap(self, method: str, other: str, *keys: str) -> tuple[float, np.ndarray]:
+        """By how much more `method` loses than `other`, both on the tasks of `tasks` of both: a
+        task that one of them cannot do must not weigh on the other alone."""
+        shared = [task for task in self.tasks(method) if task in self.tasks(other)]
+        more, less = (self.loss(name, *keys, tasks=shared) for name in (method, other))
+        return more[0] - less[0], more[1] - less[1]
 
     def mean_loss(self, method: str) -> tuple[float, np.ndarray]:
         """Over the seven shifted domains."""
@@ -117,12 +127,6 @@ class Claim(NamedTuple):
 Ask = Callable[[Posterior], list[Question]]
 
 
-def _minus(
-    text: str, more: tuple[float, np.ndarray], less: tuple[float, np.ndarray], *, by: float = 0.0
-) -> Question:
-    return Question(text, estimate((more[0] - less[0] - by, more[1] - less[1] - by)))
-
-
 def _label(method: str) -> str:
     return paper.method_label(method)
 
@@ -132,27 +136,39 @@ _BARELY = 0.15  # "barely affected": a loss larger than PALM's by less than this
 _FAILS = 0.3  # "fails": a loss of at least this
 
 
+def _gain(text: str, p: Posterior, more: str, less: str) -> Question:
+    """In-domain."""
+    (high, high_draws), (low, low_draws) = p.success(more), p.success(less)
+    return Question(f"in-domain success, {text}", estimate((high - low, high_draws - low_draws)))
+
+
+def _gap(text: str, p: Posterior, more: str, less: str, *keys: str) -> Question:
+    return Question(text, estimate(p.gap(more, less, *keys)))
+
+
 def _c1(p: Posterior) -> list[Question]:
-    palm = p.mean_loss("palm")
-    return [_minus(f"mean loss, {_label(b)} - PALM", p.mean_loss(b), palm) for b in _BASELINES]
+    return [
+        _gap(f"mean loss, {_label(b)} - PALM", p, b, "palm", *paper.OOD_DOMAINS) for b in _BASELINES
+    ]
 
 
 def _c2(p: Posterior) -> list[Question]:
-    return [_minus("in-domain success, PALM - BC", p.success("palm"), p.success("bc"))]
+    return [_gain("PALM - BC", p, "palm", "bc")]
 
 
 def _c3(p: Posterior) -> list[Question]:
-    palm = p.mean_loss("palm")
-    parts = ("palm-crop", "palm-prop")
-    return [_minus(f"mean loss, {_label(m)} - PALM", p.mean_loss(m), palm) for m in parts]
+    return [
+        _gap(f"mean loss, {_label(m)} - PALM", p, m, "palm", *paper.OOD_DOMAINS)
+        for m in ("palm-crop", "palm-prop")
+    ]
 
 
 def _c4(p: Posterior) -> list[Question]:
     crop, prop = "palm-crop", "palm-prop"
     return [
-        _minus("loss in E, w/o crop - w/o aligned proprio", p.loss(crop, "E"), p.loss(prop, "E")),
-        _minus("loss in W, w/o aligned proprio - PALM", p.loss(prop, "W"), p.loss("palm", "W")),
-        _minus("loss in V, w/o aligned proprio - PALM", p.loss(prop, "V"), p.loss("palm", "V")),
+        _gap("loss in E, w/o crop - w/o aligned proprio", p, crop, prop, "E"),
+        _gap("loss in W, w/o aligned proprio - PALM", p, prop, "palm", "W"),
+        _gap("loss in V, w/o aligned proprio - PALM", p, prop, "palm", "V"),
     ]
 
 
@@ -160,20 +176,18 @@ def _c5(p: Posterior) -> list[Question]:
     questions = []
     for method in ("palm-overlay", "palm-aug"):
         name = _label(method).removeprefix("PALM ")
-        both, palm = p.loss(method, "W", "V"), p.loss("palm", "W", "V")
+        value, draws = p.gap(method, "palm", "W", "V")
         text = f"{_BARELY} - (loss in W and V, {name} - PALM)"
-        rest = (_BARELY - (both[0] - palm[0]), _BARELY - (both[1] - palm[1]))
-        questions.append(Question(text, estimate(rest)))
-        embodied = (p.loss(method, "E"), p.loss("palm", "E"))
-        questions.append(_minus(f"loss in E, {name} - PALM", *embodied))
+        questions.append(Question(text, estimate((_BARELY - value, _BARELY - draws))))
+        questions.append(_gap(f"loss in E, {name} - PALM", p, method, "palm", "E"))
     return questions
 
 
 def _c6(p: Posterior) -> list[Question]:
-    nothing = (0.0, np.zeros(_DRAWS))
+    lost = {key: p.loss("bc", key) for key in ("W", "V")}
     return [
-        _minus(f"loss of BC in {key} - {_FAILS}", p.loss("bc", key), nothing, by=_FAILS)
-        for key in ("W", "V")
+        Question(f"loss of BC in {key} - {_FAILS}", estimate((value - _FAILS, draws - _FAILS)))
+        for key, (value, draws) in lost.items()
     ]
 
 
@@ -181,28 +195,24 @@ _OWN = (("mirrorduo", "W"), ("roviaug", "V"), ("arro", "E"))
 
 
 def _c7(p: Posterior) -> list[Question]:
-    questions = [
-        _minus(f"loss in {key}, BC - {_label(m)}", p.loss("bc", key), p.loss(m, key))
-        for m, key in _OWN
-    ]
+    questions = [_gap(f"loss in {key}, BC - {_label(m)}", p, "bc", m, key) for m, key in _OWN]
     for method, _ in _OWN:
-        apart = [(p.loss(method, key), p.loss("palm", key)) for key in paper.OOD_DOMAINS]
-        value = min(theirs[0] - ours[0] for theirs, ours in apart)
-        draws = np.min([theirs[1] - ours[1] for theirs, ours in apart], axis=0)
+        apart = [p.gap(method, "palm", key) for key in paper.OOD_DOMAINS]
+        value = min(gap for gap, _ in apart)
+        draws = np.min([draws for _, draws in apart], axis=0)
         text = f"loss, {_label(method)} - PALM, the smallest of seven domains"
         questions.append(Question(text, estimate((value, draws))))
     return questions
 
 
 def _c8(p: Posterior) -> list[Question]:
-    return [_minus("in-domain success, BC - RoVi-Aug", p.success("bc"), p.success("roviaug"))]
+    return [_gain("BC - RoVi-Aug", p, "bc", "roviaug")]
 
 
 def _c9(p: Posterior) -> list[Question]:
-    palm = p.loss("palm", "E")
     return [
-        _minus("loss in E, ARRO - PALM", p.loss("arro", "E"), palm),
-        _minus("loss in E, w/o overlay - PALM", p.loss("palm-overlay", "E"), palm),
+        _gap("loss in E, ARRO - PALM", p, "arro", "palm", "E"),
+        _gap("loss in E, w/o overlay - PALM", p, "palm-overlay", "palm", "E"),
     ]
 
 

@@ -96,8 +96,9 @@ def _means(rows: claims.Rows) -> str:
         losses = [claims.estimate(posterior.loss(method, key)) for key in paper.OOD_DOMAINS]
         mean = claims.estimate(posterior.mean_loss(method))
         ours = [claims.estimate(posterior.success(method)), *losses, mean]
-        left_out = len(rows) - len(posterior.tasks(method))
-        name = paper.method_label(method) + (f" ({left_out} tasks left out)" if left_out else "")
+        left_out = [paper.task_label(t) for t in rows if t not in posterior.tasks(method)]
+        losses_of = f" (losses without {' and '.join(left_out)})" if left_out else ""
+        name = _cell(paper.method_label(method) + losses_of)
         body.append([name, *map(_interval, ours)])
         if (base := paper.in_domain_success(method)) is not None:
             theirs = [base, *(paper.degradation(method, key) for key in paper.OOD_DOMAINS)]
