@@ -103,6 +103,7 @@ METHODS: dict[str, Method] = {
             name="palm-prop",
             title="PALM with BC's world-frame pose",
             layout="world6d_xyz",
+            hand="both",  # as BC: in the world's frame a turned hand is a yaw never seen
         ),
         BC,
         dataclasses.replace(
@@ -132,7 +133,8 @@ def find(name: str) -> Method:
     """A method by name; "palm+mirrorduo" is PALM with what the baselines behind it add.
 
     Raises:
-      ValueError: unknown; the message lists the known ones.
+      ValueError: unknown (the message lists the known ones), a part that adds nothing, or a second
+        one that makes more of the demonstrations: those it makes are none that can be rendered.
     """
     first, *rest = name.split("+")
     for part in (first, *rest):
@@ -141,11 +143,18 @@ def find(name: str) -> Method:
     method = METHODS[first]
     for part in rest:
         method = _with(method, METHODS[part])
+    if len(method.transforms) > 1:
+        raise ValueError(f"{name}: of mirrorduo and roviaug a method can have one")
     return dataclasses.replace(method, name=name)
 
 
 def _with(method: Method, other: Method) -> Method:
     """`method` with the transforms and the isolation of `other`."""
+    if not other.transforms and (method.isolate or not other.isolate):
+        adding = [each.name for each in METHODS.values() if each.transforms or each.isolate]
+        raise ValueError(
+            f"{other.name} adds nothing to {method.name}; behind a + can stand {', '.join(adding)}"
+        )
     return dataclasses.replace(
         method,
         title=f"{method.title}; with {other.title}",

@@ -187,6 +187,7 @@ _START_ANEW = (
     "from their folders, and other shards' merged anew"
 )
 _MUST_AGREE = ("preset", "recipe", "domains", "versions")
+_ORIGIN = ("machine", "commit")  # of those that made cells, not of those that enter or merge them
 
 
 def read(path: Path, fresh: dict[str, Any]) -> dict[str, Any]:
@@ -196,7 +197,7 @@ def read(path: Path, fresh: dict[str, Any]) -> dict[str, Any]:
       ConfigError: it was made under other conditions; the message names the field.
     """
     if not path.exists():
-        return {"header": {**fresh}, "results": {}, "failed": {}}
+        return {"header": {**fresh, **dict.fromkeys(_ORIGIN, "")}, "results": {}, "failed": {}}
     try:
         table: dict[str, Any] = records.load_json(path)
     except records.RecordError as error:
@@ -295,7 +296,6 @@ def _run_cell(
             _put(table, "failed", cell, str(log))
             words = f"{cell.name} failed (exit code {code}): see {log}"
             console.print(words, style="bold red", markup=False)
-        _note_origin(table["header"], fresh)
         _store(config.file, table)
 
 
@@ -312,7 +312,10 @@ def _whole(folder: Path, console: Console) -> bool:
 def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
     """What a finished cell left in its folder, into the table and the file beside it."""
     folder = config.folder / cell.name
-    _check_versions(table["header"], folder)
+    sessions = _sessions(folder)
+    _check_versions(table["header"], sessions, folder)
+    for entry in sessions:
+        _note_origin(table["header"], entry)
     _keep_episodes(config.file, {cell: records.load_eval(folder / "eval.npz")})
     _put(table, "results", cell, records.load_counts(folder / "eval.json"))
     _drop(table, "failed", cell)
@@ -324,10 +327,17 @@ def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
     _note_speed(table)
 
 
-def _check_versions(header: Mapping[str, Any], folder: Path) -> None:
-    """Raises ConfigError for a cell that was worked on under other versions than the table's."""
+def _sessions(folder: Path) -> list[dict[str, Any]]:
+    """Where, when and with what a cell was worked on."""
     path = folder / "env.json"
-    for entry in records.load_sessions(path) if path.exists() else []:
+    return records.load_sessions(path) if path.exists() else []
+
+
+def _check_versions(
+    header: Mapping[str, Any], sessions: Sequence[Mapping[str, Any]], folder: Path
+) -> None:
+    """Raises ConfigError for a cell that was worked on under other versions than the table's."""
+    for entry in sessions:
         if found := versions.difference(entry.get("versions"), header["versions"]):
             name, old, new = found
             raise ConfigError(
@@ -513,11 +523,11 @@ def _episodes_of(table: Path) -> dict[Cell, dict[str, records.DomainRecord]]:
     return found
 
 
-def _note_origin(header: dict[str, Any], other: dict[str, Any]) -> None:
-    """Machines and commits that results came from, those of `other` added to `header`."""
-    for name in ("machine", "commit"):
-        seen = {*str(header.get(name)).split("; "), *str(other.get(name)).split("; ")}
-        header[name] = "; ".join(sorted(seen))
+def _note_origin(header: dict[str, Any], made: Mapping[str, Any]) -> None:
+    """Adds where and by which commits results were made, as `made` has it, to a header."""
+    for name in _ORIGIN:
+        words = (str(part[name]).split("; ") for part in (header, made) if part.get(name))
+        header[name] = "; ".join(sorted(set().union(*words)))
 
 
 def _merge_all(config: TableConfig, table: dict[str, Any], fresh: dict[str, Any]) -> None:

@@ -253,6 +253,24 @@ def test_every_cell_notes_its_demonstrations(tmp_path: Path, trainer: Trainer) -
     }
 
 
+def test_the_header_says_where_cells_were_made(tmp_path: Path, trainer: Trainer) -> None:
+    """Not where they are entered or merged, nor where one failed."""
+    config = dataclasses.replace(SMALL, out=tmp_path / "one", seeds=(0,), methods=("palm",))
+    trainer.env = {"sessions": [{"machine": "A", "commit": "x"}, {"machine": "B", "commit": "x"}]}
+    assert run(dataclasses.replace(config, tasks=("lift_lid",))) == 0
+    trainer.env, trainer.failing = {"machine": "D", "commit": "z"}, {"lift_spam/palm-s0"}
+    assert run(config) == 1
+    header = json.loads(config.file.read_text())["header"]
+    assert (header["machine"], header["commit"]) == ("A; B", "x")
+    trainer.env = {"sessions": [{"machine": "C", "commit": "y"}]}
+    other = dataclasses.replace(config, out=tmp_path / "two", methods=("bc",))
+    assert run(other) == 0
+    joined = dataclasses.replace(config, json=tmp_path / "joined.json")
+    assert run(dataclasses.replace(joined, merge=(config.file, other.file))) == 1  # the failed one comes along
+    header = json.loads(joined.file.read_text())["header"]
+    assert (header["machine"], header["commit"]) == ("A; B; C", "x; y")
+
+
 @pytest.mark.parametrize(("name", "value"), [("noise", 0.01), ("seed", 5)])
 def test_demonstrations_of_another_recipe_are_refused(
     name: str, value: float, tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture[str]

@@ -161,6 +161,20 @@ def test_methods_compose_by_name() -> None:
         methods.find("palm+mirror")
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("palm+mirrorduo+roviaug", "of mirrorduo and roviaug a method can have one"),
+        ("roviaug+mirrorduo", "can have one"),
+        ("bc+palm", "palm adds nothing to bc; behind a [+] can stand mirrorduo, roviaug, arro"),
+        ("palm+arro+arro", "arro adds nothing to palm"),
+    ],
+)
+def test_what_cannot_be_composed_is_refused(name: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        methods.find(name)
+
+
 def test_isolated_palm_keeps_its_overlay(recorded: demos.Demos) -> None:
     _, batch = training_set(recorded, "palm+arro")
     image = batch.images[VIEW]
