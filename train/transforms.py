@@ -70,8 +70,9 @@ def mirrored(key: jax.Array, source: Source, batch: Batch) -> Batch:
     Images are flipped left to right. A TCP pose X in the camera's frame becomes E X E', with E the
     mirror at the camera's vertical plane and E' that at the TCP's x-z plane, which keeps the frame
     right-handed and the same fingers on the same axis; a delta in the TCP's frame becomes E' d E'.
-    The world is symmetric under this as far as the camera stands in its plane of symmetry. Where
-    the method draws an overlay it is drawn anew: its colours tell the axes apart.
+    The world is symmetric under this as far as the camera stands in its plane of symmetry, but for
+    the lights and the table's grain. Where the method draws an overlay it is drawn anew: its
+    colours tell the axes apart.
     """
     del key
     images, cameras = batch.images[source.view], batch.cameras[source.view]
@@ -133,7 +134,7 @@ TRANSLATION, ROTATION = 0.1, 0.05
 """Largest offset (metres) and turn (radians) of a novel view along and about each camera axis: the
 smallest of the ranges that RoVi-Aug publishes, its scene units taken as metres."""
 
-_DETAIL = 2  # a reconstruction keeps every second pixel...
+_DETAIL = 2  # a reconstruction has the detail of pixels of this size...
 _NOISE = 0.03  # ...and is off by this much of the whole range, in patches of that size
 
 
@@ -208,8 +209,8 @@ def _cameras(source: Source, camera_to_world: np.ndarray) -> Camera:
 def rerendered(key: jax.Array, source: Source, camera_to_world: np.ndarray) -> np.ndarray:
     """A surrogate for a novel-view model: the renderer itself, with a reconstruction's faults.
 
-    The picture loses every second pixel and gets patches of noise; the geometry is exact, which a
-    diffusion model's is not.
+    The picture is averaged over patches of 2 x 2 pixels, which get noise; the geometry is exact,
+    which a diffusion model's is not.
     """
     images, _, _ = demonstrations.render_observations(
         source.runner, _moved(source.demos, camera_to_world), source.spec, frame=source.frame

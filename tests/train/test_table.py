@@ -266,7 +266,8 @@ def test_the_header_says_where_cells_were_made(tmp_path: Path, trainer: Trainer)
     other = dataclasses.replace(config, out=tmp_path / "two", methods=("bc",))
     assert run(other) == 0
     joined = dataclasses.replace(config, json=tmp_path / "joined.json")
-    assert run(dataclasses.replace(joined, merge=(config.file, other.file))) == 1  # the failed one comes along
+    merged = run(dataclasses.replace(joined, merge=(config.file, other.file)))
+    assert merged == 1  # the one that failed comes along
     header = json.loads(joined.file.read_text())["header"]
     assert (header["machine"], header["commit"]) == ("A; B; C", "x; y")
 

@@ -76,6 +76,15 @@ def test_every_policy_has_its_counts(page: str, made: Path) -> None:
                 assert re.search(r"\| " + cells[0] + r" \([^|]*\| " + " | ".join(cells[1:]), page)
 
 
+def test_who_learns_nothing_has_nothing_to_lose() -> None:
+    def row(solved: int) -> list[str]:
+        counts = {domain: {"successes": 0, "episodes": 20, "nan": 0} for domain in DOMAINS}
+        counts["in_domain"]["successes"] = solved
+        return table_page._policy({"preset": "cpu"}, "lift_lid", "bc", "0", counts)
+
+    assert row(1)[-2] == "-" and row(2)[-2] == "1.00"
+
+
 def test_the_command_beside_a_policy_is_its_own(page: str) -> None:
     commands = re.findall(r"`python -m palm_jax\.train ([^`]*)`", page)
     parsed = [config.parse(words.split()) for words in commands]
