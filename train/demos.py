@@ -14,6 +14,7 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -221,17 +222,8 @@ def load(path: Path, *, task: str, robot: str, count: int | None = None) -> Demo
     Raises:
       DemoFileError: truncated, of another task, robot or version, or with too few demonstrations.
     """
-    try:
-        with h5py.File(path, "r") as file:
-            if wrong := hdf5_files.way_out(file):
-                raise DemoFileError(f"{path}: {wrong}")
-            return _read(file["data"], path, task, robot, count)
-    except DemoFileError:
-        raise
-    except (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
-        raise DemoFileError(
-            f"{path} is not a whole demonstration file ({error}); move it away and collect again"
-        ) from error
+    with _opened(path) as data:
+        return _read(data, path, task, robot, count)
 
 
 def collected_with(path: Path) -> dict[str, Any]:
@@ -240,14 +232,24 @@ def collected_with(path: Path) -> dict[str, Any]:
     Raises:
       DemoFileError: it is no file of demonstrations.
     """
+    with _opened(path) as data:
+        return {name: np.asarray(data.attrs.get(name)).item() for name in ("seed", "noise")}
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[h5py.Group]:
+    """The demonstrations in a file; whatever is wrong with it becomes a DemoFileError."""
     try:
         with h5py.File(path, "r") as file:
-            attributes = dict(file["data"].attrs)
-    except (OSError, KeyError, RuntimeError) as error:
+            if wrong := hdf5_files.way_out(file):
+                raise DemoFileError(f"{path}: {wrong}")
+            yield file["data"]
+    except DemoFileError:
+        raise
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
         raise DemoFileError(
             f"{path} is not a whole demonstration file ({error}); move it away and collect again"
         ) from error
-    return {name: np.asarray(attributes.get(name)).item() for name in ("seed", "noise")}
 
 
 def _read(data: h5py.Group, path: Path, task: str, robot: str, count: int | None) -> Demos:

@@ -38,6 +38,18 @@ def load(path: Path, **options: Any) -> demos.Demos:
     return demos.load(path, **{"task": "lift_spam", "robot": "panda", **options})
 
 
+def test_a_file_tells_how_it_was_collected(recorded: Path, tmp_path: Path) -> None:
+    assert demos.collected_with(recorded) == {"seed": 4, "noise": 0.004}
+    other = tmp_path / "other.hdf5"
+    with h5py.File(other, "w") as file:
+        file.create_group("data").attrs["seed"] = [1, 2]
+    with pytest.raises(demos.DemoFileError, match="other.hdf5 is not a whole demonstration file"):
+        demos.collected_with(other)
+    with h5py.File(other, "a") as file:
+        del file["data"].attrs["seed"]
+    assert demos.collected_with(other) == {"seed": None, "noise": None}
+
+
 @pytest.mark.slow
 def test_the_layout_is_robomimics(recorded: Path) -> None:
     """What robomimic's own tools read: demo names, sizes, totals, env_args, model_file."""
