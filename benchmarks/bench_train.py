@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.common import headline, measure, side_by_side
 from benchmarks.peers import train as others
 from palm_jax import align
-from palm_jax.train import learner
+from palm_jax.train import learner, loop
 
 SIDE = 84
 PROPRIO_DIM = 8
@@ -87,8 +87,8 @@ def _trainer(config: learner.LearnerConfig, data: learner.Batch, bank: jax.Array
 
     def step() -> None:
         nonlocal state, done
-        indices = learner.batch_indices(key, done, SAMPLES, config.batch_size)
-        batch = learner.take(data, indices)
+        indices = loop.batch_indices(key, done, SAMPLES, config.batch_size)
+        batch = loop.take(data, indices)
         state, _ = jax.block_until_ready(made.jitted_step(key, state, batch, bank))
         done += 1
 

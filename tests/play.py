@@ -22,7 +22,7 @@ import jax
 import numpy as np
 from faults.damaged_files import demonstrations
 
-from palm_jax.train import checkpoint, evaluate, learner, report, run, training, workspace
+from palm_jax.train import checkpoint, evaluate, learner, loop, report, run, training, workspace
 from palm_jax.train.config import Config
 from palm_jax.train.evaluate import Evaluator, Runners
 from palm_jax.train.files.metrics import MetricsLog
@@ -111,9 +111,9 @@ def _runners(*_: object, **__: object) -> Any:
 
 
 def _training(folder: Path, fail_at: int) -> Callable[..., learner.TrainState]:
-    """`learner.run`, whose result the first process leaves in FOLDER/final.npz, and which fails
+    """`loop.run`, whose result the first process leaves in FOLDER/final.npz, and which fails
     before an update."""
-    train = learner.run
+    train = loop.run
 
     def kept(*arguments: Any, should_stop: Callable[[], bool], **options: Any) -> Any:
         calls = itertools.count(1)

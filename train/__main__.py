@@ -23,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     from palm_jax.train.files.locks import Busy
     from palm_jax.train.files.records import RecordError
     from palm_jax.train.host import devices, interrupts
-    from palm_jax.train.learner import NonFiniteError
+    from palm_jax.train.loop import NonFiniteError
     from palm_jax.train.reporting import console as terminal
 
     console = terminal.make_console()

@@ -23,17 +23,17 @@ from palm_jax.train.learner import (
     Failure,
     Learner,
     LearnerConfig,
-    NonFiniteError,
     compiler_options,
     make_learner,
 )
+from palm_jax.train.loop import NonFiniteError
 
 DUMPS = "dumps"
 
 
 @contextlib.contextmanager
 def dumping(folder: Path, learner: Learner) -> Iterator[Callable[[Failure], None]]:
-    """Around `learner.run`: what to give it as `on_failure`; the error then names the dump.
+    """Around `loop.run`: what to give it as `on_failure`; the error then names the dump.
 
     Args:
       folder: of the dumps.

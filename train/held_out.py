@@ -8,8 +8,9 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
-from palm_jax.train import learner
+from palm_jax.train import learner, loop
 
 ACTION_NAMES = ("r1x", "r1y", "r1z", "r2x", "r2y", "r2z", "x", "y", "z", "gripper")
 """Of the action's ten numbers: the rotation's two columns, the translation, the gripper."""
@@ -18,7 +19,7 @@ ACTION_NAMES = ("r1x", "r1y", "r1z", "r2x", "r2y", "r2z", "x", "y", "z", "grippe
 def loss(model: learner.Learner, policy: learner.PolicyState, data: learner.Batch) -> float:
     """Mean square error over all ten numbers, normalised units, without augmentation and noise: the
     training's loss on other data."""
-    predicted, labels = learner.predicted(model, policy, data)
+    predicted, labels = predictions(model, policy, data)
     return float(np.square(predicted - labels).mean(dtype=np.float64))
 
 
@@ -34,11 +35,11 @@ def measure(
       "standing_still": median motion; gripper: share of frames with the right command, and
       "constant": that of the better constant command.
     """
-    predicted, labels = learner.predicted(model, policy, data)
+    predicted, labels = predictions(model, policy, data)
     ranges = policy.normalizer.action
     actions = np.asarray(learner.to_action(ranges.denormalize(jnp.asarray(predicted))))
     wanted = np.asarray(data.actions, np.float32)
-    r2 = learner.determination(predicted, labels)
+    r2 = determination(predicted, labels)
     gripper, opens = actions[:, learner.GRIPPER], wanted[:, learner.GRIPPER] > 0.5
     return {
         "frames": len(wanted),
@@ -60,6 +61,61 @@ def measure(
             "constant": float(max(opens.mean(), 1 - opens.mean())),
         },
     }
+
+
+def predictions(
+    model: learner.Learner,
+    policy: learner.PolicyState,
+    data: learner.Batch,
+    *,
+    rows: ArrayLike | None = None,
+    batch_size: int = 256,
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a policy makes of labelled samples, without augmentation and noise.
+
+    Args:
+      model: from `learner.make_learner`.
+      policy: from `model.policy_state`.
+      data: labelled samples in host memory.
+      rows: indices of the n samples to use; all by default.
+      batch_size: samples per call.
+
+    Returns:
+      prediction and label, [n, 10] each, normalised units.
+    """
+    indices = np.arange(len(data.proprio)) if rows is None else np.asarray(rows)
+    chunks = []
+    for start in range(0, len(indices), batch_size):
+        # Always a full batch, so that there is one compilation; the surplus is cut off.
+        chunk = np.resize(indices[start : start + batch_size], batch_size)
+        part = loop.take(data, chunk)
+        prediction, _ = model.jitted_predict(policy, part.images, part.proprio)
+        chunks.append(np.asarray(prediction))
+    labels = policy.normalizer.action.normalize(jnp.asarray(data.actions[indices]))
+    return np.concatenate(chunks)[: len(indices)], np.asarray(labels)
+
+
+def determination(predictions: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """[D] coefficient of determination of each column of [n, D]; NaN where labels are constant."""
+    residual = np.square(labels - predictions).sum(axis=0)
+    spread = np.square(labels - labels.mean(axis=0)).sum(axis=0)
+    return 1 - residual / np.where(spread > 0, spread, np.nan)
+
+
+def action_r2(
+    model: learner.Learner,
+    policy: learner.PolicyState,
+    data: learner.Batch,
+    *,
+    rows: ArrayLike | None = None,
+    batch_size: int = 256,
+) -> np.ndarray:
+    """Coefficient of determination of each action dimension, [10]; NaN where the label is constant.
+
+    A low mean loss can hide that nothing was learnt sideways; look at this on the frames where the
+    gripper is open. Arguments as of `predictions`.
+    """
+    return determination(*predictions(model, policy, data, rows=rows, batch_size=batch_size))
 
 
 def _median_norm(vectors: np.ndarray) -> float:

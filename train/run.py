@@ -14,7 +14,17 @@ from rich.console import Console
 
 from palm_jax.envs import physics, shifts
 from palm_jax.envs.rollout import Runner
-from palm_jax.train import demos, learner, methods, report, sweep, training, transforms, workspace
+from palm_jax.train import (
+    demos,
+    learner,
+    loop,
+    methods,
+    report,
+    sweep,
+    training,
+    transforms,
+    workspace,
+)
 from palm_jax.train.config import Config, ConfigError, default_out
 from palm_jax.train.evaluate import (
     VIEW,
@@ -141,7 +151,7 @@ def _share_training(config: Config, evaluator: Evaluator, data: learner.Batch) -
     stop = interrupts.Stop(training.PROMISE)
     together = devices.Together(stop)
     with stop.listening():
-        learner.run(
+        loop.run(
             evaluator.learner,
             data,
             seed=config.seed,

@@ -14,7 +14,7 @@ import jax
 from rich.console import Console
 
 from palm_jax.align import procedural_bank
-from palm_jax.train import checkpoint, debug, learner, workspace
+from palm_jax.train import checkpoint, debug, learner, loop, workspace
 from palm_jax.train.config import Learning
 from palm_jax.train.files import pictures, records
 from palm_jax.train.files.metrics import MetricsLog, write_json
@@ -71,7 +71,7 @@ class Training:
         Raises:
           ConfigError: begun under other versions.
           Interrupted: stopped on request.
-          NonFiniteError: see `learner.run`; the message names a dump.
+          NonFiniteError: see `loop.run`; the message names a dump.
         """
         config, store = self.config, self.folder / "checkpoints"
         fingerprint = workspace.fingerprints(self.folder)[0]
@@ -113,7 +113,7 @@ class Training:
             with timed(self.folder, "training_and_selection_s"), dumped as dump:
                 if begun:
                     self._score_if_missing(begun.path, done, begun.state, log)
-                learner.run(
+                loop.run(
                     self.model,
                     data,
                     seed=config.seed,

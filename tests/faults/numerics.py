@@ -11,7 +11,7 @@ import rooms
 from faults.cases import Outcome, case, refused
 
 from palm_jax.envs.rollout import repeat_params
-from palm_jax.train import debug, evaluate, learner, sweep
+from palm_jax.train import debug, evaluate, learner, loop, sweep
 from palm_jax.train.files import records
 
 POLICY: Any = None
@@ -44,7 +44,7 @@ for _name in ("proprio", "actions"):
         values[3, 1] = np.inf
         model = learner.make_learner(CONFIG, play.PROPRIO)
         with refused(ValueError, f"{field} has non-finite values"):
-            learner.run(model, dataclasses.replace(data, **{field: values}), seed=0)
+            loop.run(model, dataclasses.replace(data, **{field: values}), seed=0)
         return Outcome("refused before anything is compiled")
 
 
@@ -56,10 +56,10 @@ def _bad_updates(folder: Path) -> Outcome:
     config = dataclasses.replace(CONFIG, max_skipped_steps=3, ema=0.0)
     model = learner.make_learner(config, play.PROPRIO)
     bad = dataclasses.replace(data, actions=actions)
-    with refused(learner.NonFiniteError, "max_skipped_steps = 3", "debug replay"):
+    with refused(loop.NonFiniteError, "max_skipped_steps = 3", "debug replay"):
         with debug.dumping(folder, model) as on_failure:
             bank = play.backgrounds(SIDE)
-            learner.run(model, bad, seed=0, bank=bank, log_every=5, on_failure=on_failure)
+            loop.run(model, bad, seed=0, bank=bank, log_every=5, on_failure=on_failure)
     (dump,) = folder.iterdir()
     lines = debug.replay(dump)
     assert "The first that is not finite is input/target" in lines[1], lines

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from palm_jax import align
-from palm_jax.train import debug, learner
+from palm_jax.train import debug, learner, loop
 
 CONFIG = learner.LearnerConfig(
     width=2, crop=20, embed=4, hidden=(8,), batch_size=4, steps=24, max_skipped_steps=2
@@ -32,9 +32,9 @@ def model() -> learner.Learner:
 def run(model: learner.Learner, data: learner.Batch, folder: Path, **options: Any) -> Path:
     """Trains until it stops; the dump that the error names."""
     options = {"log_every": 4, **options}
-    with pytest.raises(learner.NonFiniteError, match="max_skipped_steps = 2") as caught:
+    with pytest.raises(loop.NonFiniteError, match="max_skipped_steps = 2") as caught:
         with debug.dumping(folder, model) as on_failure:
-            learner.run(model, data, seed=0, bank=BANK, on_failure=on_failure, **options)
+            loop.run(model, data, seed=0, bank=BANK, on_failure=on_failure, **options)
     path = Path(str(caught.value).rpartition(" ")[2])
     assert "python -m palm_jax debug replay" in str(caught.value) and path.is_dir()
     return path
@@ -70,7 +70,7 @@ def test_parameters_that_overflow_are_traced_to_their_layer(
     heads["layer0"] = jax.tree.map(lambda x: np.full_like(x, 3e38), heads["layer0"])
     state = dataclasses.replace(start, params={**start.params, "head": heads})
     state = jax.tree.map(jax.numpy.array, state)
-    batch = learner.take(DATA, np.arange(4))
+    batch = loop.take(DATA, np.arange(4))
     path = debug.save(tmp_path, model, learner.Failure(jax.random.key(1), state, batch, None))
     lines = debug.replay(path)
     assert "The first that is not finite is layer hidden0" in lines[1]
@@ -83,7 +83,7 @@ def test_a_dump_keeps_cameras_and_says_when_all_is_well(
     pose = np.tile(np.diag([1.0, -1, -1, 1]).astype(np.float32), (4, 1, 1))
     camera = jax.vmap(lambda pose: align.Camera.from_fovy(40.0, 24, 24, pose))(pose)
     batch = dataclasses.replace(
-        learner.take(DATA, np.arange(4)),
+        loop.take(DATA, np.arange(4)),
         cameras={"front": camera},
         tcp=np.zeros((4, 3), np.float32),
     )

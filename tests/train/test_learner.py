@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from palm_jax import align
-from palm_jax.train import checkpoint, learner
+from palm_jax.train import checkpoint, held_out, learner, loop
 from palm_jax.train.learner import Batch, LearnerConfig, Normalizer, TrainState
 
 P = 5  # numbers of proprioception
@@ -87,7 +87,7 @@ def bare() -> learner.Learner:
 
 
 def train(full: learner.Learner, **options: Any) -> TrainState:
-    return learner.run(full, DATA, **{"seed": 3, "bank": BANK, "log_every": 1, **options})
+    return loop.run(full, DATA, **{"seed": 3, "bank": BANK, "log_every": 1, **options})
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +107,7 @@ def copy(state: TrainState) -> TrainState:
 
 
 def batch(count: int = 8) -> Batch:
-    return learner.take(DATA, np.arange(count))
+    return loop.take(DATA, np.arange(count))
 
 
 def bits(tree: Any) -> list[bytes]:
@@ -224,7 +224,7 @@ def test_batch_errors_say_what_came() -> None:
 
 def order(seed: int, steps: range, count: int, size: int) -> np.ndarray:
     key = jax.random.key(seed)
-    return np.concatenate([learner.batch_indices(key, step, count, size) for step in steps])
+    return np.concatenate([loop.batch_indices(key, step, count, size) for step in steps])
 
 
 @pytest.mark.parametrize(("count", "size"), [(22, 8), (5, 8), (8, 8), (1, 3)])
@@ -239,12 +239,12 @@ def test_every_sample_once_an_epoch(count: int, size: int) -> None:
 def test_the_order_is_a_function_of_seed_and_step() -> None:
     forward = order(0, range(10), 22, 8)
     backward = np.concatenate(
-        [learner.batch_indices(jax.random.key(0), step, 22, 8) for step in reversed(range(10))]
+        [loop.batch_indices(jax.random.key(0), step, 22, 8) for step in reversed(range(10))]
     )
     np.testing.assert_array_equal(forward, backward.reshape(10, 8)[::-1].ravel())
     assert not np.array_equal(forward, order(1, range(10), 22, 8))
     with pytest.raises(ValueError, match="no samples"):
-        learner.batch_indices(jax.random.key(0), 0, 0, 8)
+        loop.batch_indices(jax.random.key(0), 0, 0, 8)
 
 
 # ---------------------------------------------------------------------------------- one bare step
@@ -279,10 +279,10 @@ def test_it_learns(bare: learner.Learner) -> None:
     """The first translation is in the image only: predicting it needs the encoder."""
     state = start(bare)
     for step in range(200):
-        indices = learner.batch_indices(jax.random.key(1), step, SAMPLES, 8)
-        state, _ = bare.jitted_step(jax.random.key(0), state, learner.take(DATA, indices))
-    score = learner.action_r2(bare, bare.policy_state(state), DATA, batch_size=8)
-    untrained = learner.action_r2(bare, bare.policy_state(start(bare)), DATA, batch_size=8)
+        indices = loop.batch_indices(jax.random.key(1), step, SAMPLES, 8)
+        state, _ = bare.jitted_step(jax.random.key(0), state, loop.take(DATA, indices))
+    score = held_out.action_r2(bare, bare.policy_state(state), DATA, batch_size=8)
+    untrained = held_out.action_r2(bare, bare.policy_state(start(bare)), DATA, batch_size=8)
     assert score.shape == (10,)
     assert score[6] > 0.7
     assert untrained[6] < 0.2
@@ -293,8 +293,8 @@ def test_r2_by_hand(bare: learner.Learner) -> None:
     rows = np.array([3, 1, 4, 15, 9, 2, 6, 5])
     constant = dataclasses.replace(DATA, actions=DATA.actions.copy())
     constant.actions[:, 2] = 0.5
-    score = learner.action_r2(bare, policy, constant, rows=rows, batch_size=8)
-    part = learner.take(constant, rows)
+    score = held_out.action_r2(bare, policy, constant, rows=rows, batch_size=8)
+    part = loop.take(constant, rows)
     predicted = np.asarray(bare.jitted_predict(policy, part.images, part.proprio)[0], np.float64)
     low, high = DATA.actions.min(axis=0), DATA.actions.max(axis=0)
     labels = 2 * (part.actions.astype(np.float64) - low) / (high - low) - 1
@@ -474,7 +474,7 @@ def test_a_turned_camera_turns_the_rotation_input_along() -> None:
 def test_turning_needs_cameras() -> None:
     made = learner.make_learner(dataclasses.replace(BARE, turn=(0.1, 0.0)), P)
     with pytest.raises(ValueError, match=r"needs those of \['front'\].*turn=\(0, 0\)"):
-        learner.run(made, DATA, seed=0, steps=1)
+        loop.run(made, DATA, seed=0, steps=1)
 
 
 def test_randomness_is_of_key_and_step(full: learner.Learner) -> None:
@@ -510,7 +510,7 @@ def test_too_many_bad_batches_stop_the_run(full: learner.Learner) -> None:
         state, params=jax.tree.map(lambda x: np.full_like(x, np.nan), state.params)
     )
     seen: list[int] = []
-    with pytest.raises(learner.NonFiniteError, match="max_skipped_steps = 1") as caught:
+    with pytest.raises(loop.NonFiniteError, match="max_skipped_steps = 1") as caught:
         train(full, state=broken, on_log=lambda step, values: seen.append(step))
     assert "2 of 2 updates" in str(caught.value)
     assert seen == [1, 2]
@@ -520,9 +520,9 @@ def test_bad_data_are_refused_before_anything_is_compiled(full: learner.Learner)
     bad = dataclasses.replace(DATA, proprio=DATA.proprio.copy())
     bad.proprio[3, 1] = np.nan
     with pytest.raises(ValueError, match="proprio has non-finite values"):
-        learner.run(full, bad, seed=0, bank=BANK)
+        loop.run(full, bad, seed=0, bank=BANK)
     with pytest.raises(ValueError, match="no bank of backgrounds"):
-        learner.run(full, DATA, seed=0)
+        loop.run(full, DATA, seed=0)
     with pytest.raises(ValueError, match="different views"):
         learner.make_learner(FULL, P, ("front", "front"))
 
