@@ -77,12 +77,6 @@ TABLE_II: dict[str, tuple[float, ...]] = {
     "bc": (0.89, 0.03, 0.09, 0.26, 0.09, 0.09, 0.26, 0.26),
     "palm": (0.88, -0.06, -0.01, 0.11, -0.02, 0.08, 0.12, 0.06),
 }
-# Table III: invisible robot, in-domain success: crop -> (6D + z, 6D + xyz).
-TABLE_III: dict[str, tuple[float, float]] = {
-    "none": (0.18, 0.40),
-    "object": (0.19, 0.33),
-    "tcp": (0.54, 0.58),
-}
 # Table IV: real robot, success in 20 trials: domain -> (drawer BC, PALM, stack BC, PALM).
 TABLE_IV: dict[str, tuple[float, float, float, float]] = {
     "ID": (0.65, 0.85, 0.65, 1.00),
