@@ -1,9 +1,9 @@
-"""The examples: the loop around a policy, with a robot of a few lines."""
+"""The examples: the loop around a policy, with a robot of a few lines; what is seen of failures."""
 
 import importlib.util
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,22 @@ import pytest
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 
-@pytest.fixture(scope="module")
-def loop() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("closed_loop", EXAMPLES / "closed_loop.py")
+def example(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def loop() -> ModuleType:
+    return example("closed_loop")
+
+
+@pytest.fixture(scope="module")
+def failures() -> ModuleType:
+    return example("failures")
 
 
 class Lift:
@@ -71,3 +80,34 @@ def test_the_robots_side_needs_no_jax(loop: ModuleType) -> None:
     top = [line for line in source.splitlines() if line.startswith(("import ", "from "))]
     assert not [line for line in top if "jax" in line]
     assert "closed_loop" not in sys.modules
+
+
+def test_an_object_is_hidden_by_what_stands_on_the_way_to_the_camera(failures: ModuleType) -> None:
+    # The camera looks from +x; places at 0, 40, 50, 180 and -40 degrees from that direction.
+    angles = np.radians([0, 40, 50, 180, -40])
+    objects = np.tile([0.2, 0.1, 0.0], (5, 1))
+    places = objects + 0.17 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
+    places[:, 2] = 0.5
+    cameras = np.tile([1.3, 0.1, 1.6], (5, 1))
+    found = failures.hidden(objects, places, cameras)
+    assert found.tolist() == [True, True, False, False, True]
+
+
+def test_episodes_are_counted_by_what_was_seen_of_them(failures: ModuleType) -> None:
+    """Three worlds, the third of which only fills the batch: body 1 is the object, 2 its place."""
+    camera = np.tile(np.eye(4), (3, 1, 1))
+    camera[:, :3, 3] = [2, 0, 1]
+    watcher = failures.Watcher(1, 2)
+    for heights in ([0.0, 0.0, 0.0], [0.05, 0.02, 0.4], [0.01, 0.0, 0.0]):
+        xpos = np.zeros((3, 3, 3))
+        xpos[:, 1, 2] = heights
+        xpos[:, 2, 0] = [0.2, -0.2, 0.2]
+        watcher(SimpleNamespace(data=SimpleNamespace(xpos=xpos), camera_to_world=camera))
+    found = watcher.outcomes(np.array([False, False]))
+    assert found.lifted.tolist() == [True, False] and found.hidden.tolist() == [True, False]
+    assert failures.lines("in_domain", found) == [
+        "in_domain: 0 of 2 solved",
+        "object behind its place: 0 of 1 solved",
+        "object elsewhere: 0 of 1 solved",
+        "failures: 1 never lifted it, 1 did",
+    ]
