@@ -177,7 +177,7 @@ def scenery(
     yield training, "backgrounds", lambda config: backgrounds(config.image_size)
     yield training, "LOG_EVERY", 1
     yield training, "MetricsLog", Told
-    yield learner, "run", _training(folder, fail_at)
+    yield loop, "run", _training(folder, fail_at)
     if hesitation:
         yield interrupts, "Stop", Noted
         yield checkpoint, "save", slow

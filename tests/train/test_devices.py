@@ -25,7 +25,7 @@ from faults import damaged_files
 from rich.console import Console
 
 from palm_jax.train import __main__ as training
-from palm_jax.train import checkpoint, learner, methods, run, workspace
+from palm_jax.train import checkpoint, learner, loop, methods, run, workspace
 from palm_jax.train.host import devices
 from palm_jax.train.host.devices import DeviceError, Split, Together
 from palm_jax.train.training import Interrupted, Score, Training
@@ -248,7 +248,7 @@ def test_who_leaves_scores_no_checkpoint_whoever_was_asked(
         raise AssertionError("a selection is played")
 
     monkeypatch.setattr(devices, "Together", Asked)
-    monkeypatch.setattr(learner, "run", stopping)
+    monkeypatch.setattr(loop, "run", stopping)
     config = dataclasses.replace(tiny.config("bc"), steps=4, checkpoint_every=2)
     workspace.begin(dataclasses.replace(config, out=tmp_path), tmp_path, "bc")
     job = Training(config, "bc", tiny.learner("bc"), tmp_path, score, augment=False)

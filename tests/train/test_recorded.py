@@ -330,7 +330,7 @@ def test_errors_of_actions_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     policy = learner.PolicyState({}, {}, learner.Normalizer(ranges, ranges))
     batch = learner.Batch({}, np.zeros((count, 1), np.float32), labels)
     monkeypatch.setattr(
-        learner, "predicted", lambda *_, **__: (normalised(answers), normalised(labels))
+        held_out, "predictions", lambda *_, **__: (normalised(answers), normalised(labels))
     )
     found = held_out.measure(None, policy, batch)  # type: ignore[arg-type]
     moves = np.linalg.norm(answers[:, 6:9] - labels[:, 6:9], axis=1)
