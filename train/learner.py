@@ -271,6 +271,7 @@ def _turned_views(
 
 
 def check_cameras(batch: Batch, views: Sequence[str]) -> None:
+    """Raise ValueError unless a batch, or a data set, has what turning its cameras needs."""
     if batch.tcp is None or set(batch.cameras) != set(views):
         raise ValueError(
             f"cameras, tcp: the configuration turns cameras, which needs those of {list(views)} "
