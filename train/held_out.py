@@ -95,9 +95,9 @@ def predictions(
     return np.concatenate(chunks)[: len(indices)], np.asarray(labels)
 
 
-def determination(predictions: np.ndarray, labels: np.ndarray) -> np.ndarray:
+def determination(predicted: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """[D] coefficient of determination of each column of [n, D]; NaN where labels are constant."""
-    residual = np.square(labels - predictions).sum(axis=0)
+    residual = np.square(labels - predicted).sum(axis=0)
     spread = np.square(labels - labels.mean(axis=0)).sum(axis=0)
     return 1 - residual / np.where(spread > 0, spread, np.nan)
 
