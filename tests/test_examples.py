@@ -93,21 +93,42 @@ def test_an_object_is_hidden_by_what_stands_on_the_way_to_the_camera(failures: M
     assert found.tolist() == [True, True, False, False, True]
 
 
-def test_episodes_are_counted_by_what_was_seen_of_them(failures: ModuleType) -> None:
-    """Three worlds, the third of which only fills the batch: body 1 is the object, 2 its place."""
-    camera = np.tile(np.eye(4), (3, 1, 1))
+def state(heights: list[float], tcp: float, openings: list[float]) -> SimpleNamespace:
+    """Worlds with the object (body 1) at these heights and its place (body 2) beside it; the first
+    place stands towards the camera."""
+    count = len(heights)
+    xpos, camera = np.zeros((count, 3, 3)), np.tile(np.eye(4), (count, 1, 1))
+    xpos[:, 1, 2] = heights
+    xpos[:, 2, 0] = [0.2, *[-0.2] * (count - 1)]
     camera[:, :3, 3] = [2, 0, 1]
-    watcher = failures.Watcher(1, 2)
-    for heights in ([0.0, 0.0, 0.0], [0.05, 0.02, 0.4], [0.01, 0.0, 0.0]):
-        xpos = np.zeros((3, 3, 3))
-        xpos[:, 1, 2] = heights
-        xpos[:, 2, 0] = [0.2, -0.2, 0.2]
-        watcher(SimpleNamespace(data=SimpleNamespace(xpos=xpos), camera_to_world=camera))
+    hand = np.full(count, tcp), np.array(openings)
+    return SimpleNamespace(data=SimpleNamespace(xpos=xpos), camera_to_world=camera, hand=hand)
+
+
+def test_episodes_are_counted_by_what_was_seen_of_them(failures: ModuleType) -> None:
+    """Three worlds, the third of which only fills the batch; the second's hand never closes."""
+    watcher = failures.Watcher(1, 2, lambda state: state.hand)
+    watcher(state([0.0, 0.0, 0.0], 0.1, [1.0, 1.0, 1.0]))
+    watcher(state([0.05, 0.02, 0.4], 0.058, [0.79, 0.81, 0.0]))
+    watcher(state([0.01, 0.0, 0.0], 0.2, [0.5, 0.9, 0.0]))
     found = watcher.outcomes(np.array([False, False]))
     assert found.lifted.tolist() == [True, False] and found.hidden.tolist() == [True, False]
+    np.testing.assert_allclose(found.closed_mm, [8.0, np.nan])
     assert failures.lines("in_domain", found) == [
         "in_domain: 0 of 2 solved",
         "object behind its place: 0 of 1 solved",
         "object elsewhere: 0 of 1 solved",
         "failures: 1 never lifted it, 1 did",
+        "mm above it when the hand closed, solved: -",
+        "mm above it when the hand closed, never lifted: -",
     ]
+
+
+def test_a_batch_that_begins_again_with_fewer_worlds_is_counted_once(failures: ModuleType) -> None:
+    watcher = failures.Watcher(1, 2, lambda state: state.hand)
+    watcher(state([0.0, 0.0, 0.0, 0.0], 0.1, [0.5, 0.5, 0.5, 0.5]))
+    watcher(state([0.0, 0.0], 0.03, [1.0, 1.0]))
+    watcher(state([0.1, 0.0], 0.02, [0.3, 0.3]))
+    found = watcher.outcomes(np.array([True, False, True, True]))
+    assert found.solved.tolist() == [True, False] and found.lifted.tolist() == [True, False]
+    np.testing.assert_allclose(found.closed_mm, [-80.0, 20.0])

@@ -257,7 +257,7 @@ class Recorded(Learning):
             )
         for name in self.method:
             method = methods.find(name)
-            if method.transforms or method.isolate:
+            if method.transform or method.isolate:
                 raise ConfigError(
                     f"method {name!r} needs the simulator ({method.title}); on recordings: "
                     + ", ".join(RECORDED_METHODS)
@@ -274,7 +274,7 @@ class Recorded(Learning):
 
 
 RECORDED_METHODS = tuple(
-    name for name, method in methods.METHODS.items() if not (method.transforms or method.isolate)
+    name for name, method in methods.METHODS.items() if not (method.transform or method.isolate)
 )
 """Methods that need nothing but images, poses and a calibration."""
 

@@ -9,7 +9,7 @@ import dataclasses
 from palm_jax.align import AlignSpec
 from palm_jax.envs.base import PAPER_FRAME, WIDE_FRAME
 from palm_jax.envs.tasks import Task
-from palm_jax.train.transforms import Transform, mirrored, novel_views, rerendered
+from palm_jax.train.transforms import ULTRA, Transform, mirrored, novel_views, rerendered
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Method:
       augment: whether Random Overlay and perspective run in training.
       frame: side in pixels of the virtual full image that a crop is clamped to.
       isolate: whether only the gripper and the task's objects are shown.
-      transforms: of the training set, one after the other; see `palm_jax.train.transforms`.
+      transform: of the training set, if any; see `palm_jax.train.transforms`.
       hand: evaluations under a turned camera: "aligned" (the hand's initial yaw turns with the
         camera, as in the authors' code for PALM), or "both": with and without, the better one
         quoted.
@@ -40,7 +40,7 @@ class Method:
     frame: int
     hand: str
     isolate: bool = False
-    transforms: tuple[Transform, ...] = ()
+    transform: Transform | None = None
 
     def spec(self, task: Task, size: int) -> AlignSpec:
         """The alignment for a task's crop at `size` x `size` pixels."""
@@ -110,14 +110,20 @@ METHODS: dict[str, Method] = {
             BC,
             name="mirrorduo",
             title="MirrorDuo: BC, and every demonstration in the mirror",
-            transforms=(mirrored,),
+            transform=mirrored,
         ),
         dataclasses.replace(
             BC,
             name="roviaug",
             title="RoVi-Aug, viewpoints only: BC, and every frame from a moved camera (surrogate: "
             "rendered again and degraded)",
-            transforms=(novel_views(rerendered),),
+            transform=novel_views(rerendered),
+        ),
+        dataclasses.replace(
+            BC,
+            name="roviaug-ultra",
+            title="RoVi-Aug with the widest views that it publishes",
+            transform=novel_views(rerendered, ULTRA),
         ),
         dataclasses.replace(
             BC,
@@ -143,21 +149,24 @@ def find(name: str) -> Method:
     method = METHODS[first]
     for part in rest:
         method = _with(method, METHODS[part])
-    if len(method.transforms) > 1:
-        raise ValueError(f"{name}: of mirrorduo and roviaug a method can have one")
     return dataclasses.replace(method, name=name)
 
 
 def _with(method: Method, other: Method) -> Method:
-    """`method` with the transforms and the isolation of `other`."""
-    if not other.transforms and (method.isolate or not other.isolate):
-        adding = [each.name for each in METHODS.values() if each.transforms or each.isolate]
+    """`method` with the transform and the isolation of `other`."""
+    if not other.transform and (method.isolate or not other.isolate):
+        adding = [each.name for each in METHODS.values() if each.transform or each.isolate]
         raise ValueError(
             f"{other.name} adds nothing to {method.name}; behind a + can stand {', '.join(adding)}"
+        )
+    if method.transform and other.transform:
+        several = [each.name for each in METHODS.values() if each.transform]
+        raise ValueError(
+            f"{method.name}+{other.name}: of {', '.join(several)} a method can have one"
         )
     return dataclasses.replace(
         method,
         title=f"{method.title}; with {other.title}",
         isolate=method.isolate or other.isolate,
-        transforms=(*method.transforms, *other.transforms),
+        transform=method.transform or other.transform,
     )

@@ -274,11 +274,11 @@ def _rendered(
     batch = learner.Batch(
         {VIEW: images}, proprio, data.actions, cameras={VIEW: cameras}, tcp=data.tcp[:, :3, 3]
     )
+    if method.transform is None:
+        return batch
+    key = jax.random.fold_in(jax.random.key(config.demo_seed), _TRANSFORM_KEY)
     source = transforms.Source(runner, data, spec, method.frame, VIEW)
-    for index, transform in enumerate(method.transforms):
-        key = jax.random.fold_in(jax.random.key(config.demo_seed), _TRANSFORM_KEY + index)
-        batch = transform(key, source, batch)
-    return batch
+    return method.transform(key, source, batch)
 
 
 def _finished(folder: Path, console: Console) -> bool:

@@ -6,7 +6,7 @@ demonstrations behind it, so that it can render once more.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -130,15 +130,24 @@ def _flipped(
 
 # -- RoVi-Aug: every demonstration once more, from another place -----------------------------------
 
-TRANSLATION, ROTATION = 0.1, 0.05
-"""Largest offset (metres) and turn (radians) of a novel view along and about each camera axis: the
-smallest of the ranges that RoVi-Aug publishes, its scene units taken as metres."""
+
+class Reach(NamedTuple):
+    """How far a novel view may be from the camera, uniformly drawn."""
+
+    translation: tuple[float, float, float]  # metres along the camera's axes: right, down, forward
+    rotation: float  # radians about each of them
+
+
+LOWER = Reach((0.1, 0.1, 0.1), 0.05)
+ULTRA = Reach((0.4, 0.1, 0.4), 0.1)
+"""The narrowest and the widest of the ranges that RoVi-Aug publishes, its scene units taken as
+metres."""
 
 _DETAIL = 2  # a reconstruction has the detail of pixels of this size...
 _NOISE = 0.03  # ...and is off by this much of the whole range, in patches of that size
 
 
-def novel_views(model: NovelViews) -> Transform:
+def novel_views(model: NovelViews, reach: Reach = LOWER) -> Transform:
     """RoVi-Aug, viewpoints only: the batch, and every frame from a camera moved at random, [2 N].
 
     Proprioception and actions stay as they are. The cameras of frames are drawn independently of
@@ -147,12 +156,13 @@ def novel_views(model: NovelViews) -> Transform:
     Args:
       model: makes the pictures; a diffusion model for novel views would be one. `rerendered`, the
         default of `roviaug`, is a surrogate.
+      reach: how far the cameras are moved.
     """
 
     def transform(key: jax.Array, source: Source, batch: Batch) -> Batch:
         pose_key, model_key = jax.random.split(key)
         old = source.demos.camera_to_world[source.demos.episode]
-        poses = (old @ np.asarray(_moves(pose_key, len(old)))).astype(np.float32)
+        poses = (old @ np.asarray(_moves(pose_key, len(old), reach))).astype(np.float32)
         other = dataclasses.replace(
             batch,
             images={source.view: model(model_key, source, poses)},
@@ -163,10 +173,10 @@ def novel_views(model: NovelViews) -> Transform:
     return transform
 
 
-def _moves(key: jax.Array, count: int) -> jax.Array:
+def _moves(key: jax.Array, count: int, reach: Reach) -> jax.Array:
     """[count, 4, 4] random motions of a camera in its own frame."""
     shift, turn = jax.random.uniform(key, (2, count, 3), minval=-1.0, maxval=1.0)
-    x, y, z = (ROTATION * turn).T
+    x, y, z = (reach.rotation * turn).T
     one, zero = jnp.ones_like(x), jnp.zeros_like(x)
 
     def about(axis: int, angle: jax.Array) -> jax.Array:
@@ -177,7 +187,7 @@ def _moves(key: jax.Array, count: int) -> jax.Array:
 
     poses = jnp.tile(jnp.eye(4), (count, 1, 1))
     poses = poses.at[:, :3, :3].set(about(2, z) @ about(1, y) @ about(0, x))
-    return poses.at[:, :3, 3].set(TRANSLATION * shift)
+    return poses.at[:, :3, 3].set(jnp.asarray(reach.translation) * shift)
 
 
 def _moved(demos: demonstrations.Demos, camera_to_world: np.ndarray) -> demonstrations.Demos:

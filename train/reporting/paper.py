@@ -22,8 +22,8 @@ DOMAINS: dict[str, str] = {
 }
 OOD_DOMAINS = tuple(name for name in DOMAINS if name != "ID")
 
-# Display names. "w/o" rows are PALM without one of its parts; PALM in the paper's narrow frame is
-# this package's own comparison.
+# Display names. "w/o" rows are PALM without one of its parts; PALM in the paper's narrow frame
+# and RoVi-Aug's widest views are this package's own comparisons.
 METHODS: dict[str, str] = {
     "bc": "BC",
     "palm": "PALM",
@@ -34,6 +34,7 @@ METHODS: dict[str, str] = {
     "palm-prop": "PALM w/o aligned proprio",
     "mirrorduo": "MirrorDuo",
     "roviaug": "RoVi-Aug",
+    "roviaug-ultra": "RoVi-Aug (widest views)",
     "arro": "ARRO",
 }
 

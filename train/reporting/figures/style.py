@@ -77,6 +77,7 @@ _LOOKS = {
     "palm-prop": Look("#8C6BB1", "P", (0, (4, 1.5))),
     "mirrorduo": Look("#E69F00", "X", (0, (1, 1))),
     "roviaug": Look("#A08C00", "<", (0, (1, 1))),
+    "roviaug-ultra": Look("#6B5E00", "p", (0, (3, 1, 1, 1))),
     "arro": Look("#4D4D4D", ">", (0, (1, 1))),
 }
 _SPARE = [Look("#882255", "h", "-."), Look("#117733", "p", "-."), Look("#332288", "*", "-.")]
