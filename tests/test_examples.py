@@ -1,11 +1,14 @@
-"""The examples: the loop around a policy, with a robot of a few lines; what is seen of failures."""
+"""The examples: the loop around a policy, with a robot of a few lines; what is seen of failures; a
+hand in other colours."""
 
+import dataclasses
 import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
@@ -132,3 +135,34 @@ def test_a_batch_that_begins_again_with_fewer_worlds_is_counted_once(failures: M
     found = watcher.outcomes(np.array([True, False, True, True]))
     assert found.solved.tolist() == [True, False] and found.lifted.tolist() == [True, False]
     np.testing.assert_allclose(found.closed_mm, [-80.0, 20.0])
+
+
+def test_a_hand_in_other_colours_keeps_everything_else() -> None:
+    """Against the colours and the tree of the model, geom by geom."""
+    from palm_jax.envs import make
+
+    repainted = example("repainted")
+    env = make("lift_lid", "ur5")
+    rgb = np.tile(np.asarray(env.default_params().geom_rgb), (2, 1, 1))
+    params = dataclasses.replace(env.default_params(), geom_rgb=rgb)
+    light, dark = repainted.hand_colours(make("lift_lid", "panda"))
+    np.testing.assert_allclose([light, dark], [[0.93, 0.93, 0.95], [0.22, 0.23, 0.26]], atol=1e-6)
+    plain = repainted.repainted(params, env, light)
+    tipped = repainted.repainted(params, env, light, dark)
+    model, ends = env.mj_model, 0
+    for row, geom in enumerate(env.scene_model.geoms):
+        body = model.geom(geom).bodyid[0]
+        while model.body(body).name not in ("gripper", "world"):
+            body = model.body(body).parentid[0]
+        own = model.geom(geom).rgba[:3]
+        wanted = light if model.body(body).name == "gripper" else own
+        np.testing.assert_allclose(plain.geom_rgb[:, row], [wanted, wanted], atol=1e-6)
+        end = model.geom(geom).name in [
+            f"{side}_finger_{part}" for side in ("left", "right") for part in ("tip", "rubber")
+        ]
+        ends += end
+        wanted = dark if end else wanted
+        np.testing.assert_allclose(tipped.geom_rgb[:, row], [wanted, wanted], atol=1e-6)
+    assert ends == 4
+    same = dataclasses.replace(tipped, geom_rgb=rgb)
+    jax.tree.map(np.testing.assert_array_equal, same, params)
