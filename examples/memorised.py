@@ -4,8 +4,8 @@
     python examples/memorised.py runs/demo/palm --data runs/demo/demos/lift_lid-panda.hdf5
 
 New demonstrations are drawn as those of the training were, from another seed. A policy that
-foretells the old ones well and new ones badly has learnt what cannot be seen again; one that
-foretells neither has not trained for long enough, or cannot see what it would need.
+foretells the old ones well and the new ones badly knows the old ones by heart; one that foretells
+neither has not trained for long enough, or cannot see what it would need.
 """
 
 import argparse
@@ -16,7 +16,8 @@ from typing import Any
 
 def line(name: str, found: dict[str, Any]) -> str:
     """For people: what `held_out.measure` found; x and y are the hand's sideways motions."""
-    r2 = ", ".join(f"{axis} {found['r2'][axis]:.2f}" for axis in ("x", "y", "z"))
+    shares = {axis: found["r2"][axis] for axis in ("x", "y", "z")}
+    r2 = ", ".join(f"{a} -" if r is None else f"{a} {r:.2f}" for a, r in shares.items())
     error, motion = (found["translation_mm"][key] for key in ("median_error", "standing_still"))
     return (
         f"{name}: {found['frames']} frames; share of variance explained: {r2}; "

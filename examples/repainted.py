@@ -87,7 +87,8 @@ def main() -> None:
         scenes = scene_key(config.eval_seed, options.domain)
         for look, painted in looks.items():
             found = record(evaluator.episodes(policy, scenes, painted, options.scenes, robot=robot))
-            print(f"{run}: {found.solved.sum()} of {len(found.solved)} solved, hand {look}")
+            solved = f"{found.solved.sum()} of {len(found.solved)} solved"
+            print(f"{run}: {solved}, hand {look}", flush=True)
 
 
 if __name__ == "__main__":

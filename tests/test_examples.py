@@ -171,10 +171,10 @@ def test_a_hand_in_other_colours_keeps_everything_else() -> None:
 def test_what_a_policy_foretells_is_told_axis_by_axis() -> None:
     found = {
         "frames": 7,
-        "r2": {"x": 0.716, "y": 0.5, "z": 0.999},
+        "r2": {"x": 0.716, "y": None, "z": 0.999},
         "translation_mm": {"median_error": 1.26, "standing_still": 5.0},
     }
     assert example("memorised").line("new ones", found) == (
-        "new ones: 7 frames; share of variance explained: x 0.72, y 0.50, z 1.00; "
+        "new ones: 7 frames; share of variance explained: x 0.72, y -, z 1.00; "
         "off by 1.3 mm of 5.0 (medians)"
     )
