@@ -44,6 +44,7 @@ class SceneModel:
       geoms: ids of the R rendered geoms in the MuJoCo model.
       rgb: [R, 3] their colours.
       robot: bool [R], the geoms that belong to the robot.
+      hand: bool [R], those of its gripper.
       objects: bool [R], those of the task's objects.
       handled: ids of the gripper's geoms and of the task's objects.
       lights: the model's lights.
@@ -56,8 +57,8 @@ class SceneModel:
         self.rgb = model.geom_rgba[self.geoms, :3].astype(np.float32)
         self.robot = _below(model, model.body("robot_base").id)[model.geom_bodyid[self.geoms]]
         self.objects = task_geoms(model)[self.geoms]
-        hand = _below(model, int(model.site("tcp").bodyid[0]))[model.geom_bodyid[self.geoms]]
-        self.handled = self.geoms[hand | self.objects]
+        self.hand = _below(model, int(model.site("tcp").bodyid[0]))[model.geom_bodyid[self.geoms]]
+        self.handled = self.geoms[self.hand | self.objects]
         distractors = [model.body(name).id for name in DISTRACTORS]
         self._distractors = np.isin(model.geom_bodyid[self.geoms], distractors)
         self._table = names.index("table_top")

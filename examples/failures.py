@@ -118,6 +118,9 @@ def main() -> None:
 
     config = workspace.stored_config(options.run)
     runners = Runners.of(config.task, config.robot, config.second_robot, options.scenes)
+    for domain in options.domains:
+        if runners.plays(domain) != config.robot:
+            parser.error(f"{domain}: expected domains of the demonstrations' robot")
     evaluator, policy = workspace.load_policy(options.run, runners)
     items = getattr(evaluator.task, "items", None)
     if not items:
@@ -126,8 +129,6 @@ def main() -> None:
     hand = jax.jit(jax.vmap(lambda state: (env.tcp(state)[2, 3], env.opening(state))))
     object_id, place_id = (env.mj_model.body(name).id for name in (items[0].body, items[0].goal))
     for domain in options.domains:
-        if runners.plays(domain) != config.robot:
-            parser.error(f"{domain}: expected domains of the demonstrations' robot")
         watcher = Watcher(object_id, place_id, hand)
         record = evaluator.domain(
             policy,

@@ -24,15 +24,10 @@ from palm_jax.envs.base import Env
 from palm_jax.envs.params import EnvParams
 
 
-def hand_geoms(env: Env) -> np.ndarray:
-    """bool [R]: which of the rendered geoms belong to the hand."""
-    scene = env.scene_model
-    return np.asarray(scene.robot & np.isin(scene.geoms, scene.handled))
-
-
 def hand_colours(env: Env) -> np.ndarray:
     """[2, 3] the two colours that most geoms of the hand have, 0..1."""
-    counts = Counter(map(tuple, env.scene_model.rgb[hand_geoms(env)].tolist()))
+    scene = env.scene_model
+    counts = Counter(map(tuple, scene.rgb[scene.hand].tolist()))
     return np.array([colour for colour, _ in counts.most_common(2)], np.float32)
 
 
@@ -41,9 +36,10 @@ def repainted(
 ) -> EnvParams:
     """`params` of `env`, any leading axes, with its hand in one colour [3], and its finger tips in
     another if one is given."""
-    names = [env.mj_model.geom(int(geom)).name for geom in env.scene_model.geoms]
-    ends = hand_geoms(env) & np.array([name.endswith(("_tip", "_rubber")) for name in names])
-    rgb = jnp.where(hand_geoms(env)[:, None], jnp.asarray(hand), jnp.asarray(params.geom_rgb))
+    scene = env.scene_model
+    names = [env.mj_model.geom(int(geom)).name for geom in scene.geoms]
+    ends = scene.hand & np.array([name.endswith(("_tip", "_rubber")) for name in names])
+    rgb = jnp.where(scene.hand[:, None], jnp.asarray(hand), jnp.asarray(params.geom_rgb))
     if tips is not None:
         rgb = jnp.where(ends[:, None], jnp.asarray(tips), rgb)
     return dataclasses.replace(params, geom_rgb=rgb)

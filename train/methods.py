@@ -122,7 +122,7 @@ METHODS: dict[str, Method] = {
         dataclasses.replace(
             BC,
             name="roviaug-ultra",
-            title="RoVi-Aug with the widest views that it publishes",
+            title="RoVi-Aug, viewpoints only, as far away as it publishes (surrogate, as roviaug)",
             transform=novel_views(rerendered, ULTRA),
         ),
         dataclasses.replace(
