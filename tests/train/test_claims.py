@@ -151,3 +151,15 @@ def test_seeds_are_summed() -> None:
     total = claims.summed({"0": one, "1": two})
     assert total == {"in_domain": {"successes": 7, "episodes": 20, "nan": 1}}
     assert one["in_domain"]["successes"] == 3
+
+
+def test_an_interval_stays_when_another_method_is_added() -> None:
+    rows = as_in_the_paper(50)
+    few = {task: {method: row[method] for method in ("palm", "bc")} for task, row in rows.items()}
+    # The order in which a page asks must not matter either.
+    asked = claims.Posterior(rows)
+    asked.mean_loss("arro")
+    found, again = (claims.estimate(p.mean_loss("bc")) for p in (asked, claims.Posterior(few)))
+    assert found == again
+    # Yet no two cells share their draws: differences of equal rates have a spread.
+    assert np.std(asked.gap("bc", "bc", "W")[1]) == 0 < np.std(asked.gap("palm", "bc", "W")[1])
