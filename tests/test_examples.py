@@ -1,5 +1,5 @@
 """The examples: the loop around a policy, with a robot of a few lines; what is seen of failures; a
-hand in other colours; what is known by heart."""
+hand in other colours or of another robot; what is known by heart."""
 
 import dataclasses
 import importlib.util
@@ -9,6 +9,7 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import jax
+import mujoco
 import numpy as np
 import pytest
 
@@ -166,6 +167,52 @@ def test_a_hand_in_other_colours_keeps_everything_else() -> None:
     assert ends == 4
     same = dataclasses.replace(tipped, geom_rgb=rgb)
     jax.tree.map(np.testing.assert_array_equal, same, params)
+
+
+@pytest.mark.parametrize("arm", [False, True])
+def test_a_borrowed_hand_is_at_the_tcp_and_as_wide_as_the_own(arm: bool) -> None:
+    """Against C MuJoCo's kinematics of both robots, each relative to its own TCP."""
+    from palm_jax.envs import make
+
+    own, lender = make("lift_lid", "ur5"), make("lift_lid", "panda")
+    data, tcp = posed(own, finger=0.015)
+    lent, lent_tcp = posed(lender, finger=0.015)
+    looks = example("borrowed").looking_like(own, lender, arm=arm).scene_model
+    params = own.default_params()
+    scene = jax.jit(looks)(data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3), params)
+
+    model = lender.scene_model
+    drawn = np.flatnonzero(model.robot if arm else model.hand)
+    assert len(scene.types) == len(own.scene_model.geoms) + len(drawn)
+    moved = tcp @ np.linalg.inv(lent_tcp)
+    for row, index in enumerate(drawn, len(own.scene_model.geoms)):
+        # An arm of another kind has another elbow: only its hand is where the other's is.
+        if model.hand[index]:
+            geom = int(model.geoms[index])
+            position = (moved @ np.append(lent.geom_xpos[geom], 1.0))[:3]
+            rotation = moved[:3, :3] @ lent.geom_xmat[geom].reshape(3, 3)
+            np.testing.assert_allclose(scene.pos[row], position, atol=1e-3)
+            np.testing.assert_allclose(scene.mat[row], rotation, atol=5e-3)
+            np.testing.assert_allclose(scene.rgb[row], lender.mj_model.geom(geom).rgba[:3])
+            assert scene.visible[row] and scene.ids[row] in own.scene_model.handled
+
+    before = own.scene_model(data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3), params)
+    gone = own.scene_model.robot if arm else own.scene_model.hand
+    rest = np.asarray(scene.visible)[: len(gone)]
+    np.testing.assert_array_equal(rest, np.asarray(before.visible) & ~gone)
+
+
+def posed(env: Any, *, finger: float) -> tuple[Any, np.ndarray]:
+    """C MuJoCo's data of a robot at home with its fingers somewhere, and the TCP [4, 4]."""
+    data = mujoco.MjData(env.mj_model)
+    for joint, value in zip(env.robot.arm_joints, env.robot.home, strict=True):
+        data.joint(joint).qpos[0] = value
+    for joint in env.robot.gripper_joints:
+        data.joint(joint).qpos[0] = finger
+    mujoco.mj_kinematics(env.mj_model, data)
+    tcp = np.eye(4)
+    tcp[:3, :3], tcp[:3, 3] = data.site("tcp").xmat.reshape(3, 3), data.site("tcp").xpos
+    return data, tcp
 
 
 def test_what_a_policy_foretells_is_told_axis_by_axis() -> None:
