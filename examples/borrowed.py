@@ -22,9 +22,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
-from palm_jax.envs import control, registry, tree
+from palm_jax.envs import control, registry
 from palm_jax.envs.base import Env
 from palm_jax.envs.params import EnvParams
 from palm_jax.envs.rollout import Runner
@@ -73,16 +72,17 @@ class Borrowed:
     def _poses(self, tcp: jax.Array, width: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The lender's geoms, [G, 3] and [G, 3, 3], with its TCP at `tcp` [4, 4] and its pads
         `width` [] metres apart."""
-        env, robot = self._lender, self._lender.robot
-        arm = control.reach(env.chain, jnp.asarray(env.chain.home), tcp)
+        env, robot, model = self._lender, self._lender.robot, self._lender.mj_model
         share = jnp.clip(width / robot.max_width, 0.0, 1.0)
         closed, opened = np.asarray(robot.gripper_closed), np.asarray(robot.gripper_open)
-        data = mjx.make_data(env.mjx_model)
-        qpos = data.qpos.at[_addresses(env, robot.arm_joints)].set(arm)
-        qpos = qpos.at[_addresses(env, robot.gripper_joints)].set(
-            closed + share * (opened - closed)
-        )
-        data = tree.kinematics(env.mjx_model, data.replace(qpos=qpos))
+        fingers = closed + share * (opened - closed)
+        arm = control.reach(env.chain, jnp.asarray(env.chain.home), tcp)
+        qpos = jnp.asarray(model.qpos0, jnp.float32)
+        qpos = qpos.at[_addresses(env, robot.arm_joints)].set(arm)
+        qpos = qpos.at[_addresses(env, robot.gripper_joints)].set(fingers)
+        # Its objects and its camera are not looked at.
+        elsewhere = jnp.zeros((model.nmocap, 3)), jnp.tile(jnp.eye(4)[0], (model.nmocap, 1))
+        data = env.restore(qpos, *elsewhere, jnp.eye(4), env.default_params()).data
         return data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3)
 
 
@@ -192,3 +192,7 @@ def main() -> None:
             solved = f"{found.solved.sum()} of {len(found.solved)} solved"
             drawn = "as it is" if look == LOOKS[0] else f"{look} drawn as the {config.robot}'s"
             print(f"{run}: {solved}, the {robot} {drawn}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
