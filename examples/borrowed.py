@@ -33,8 +33,9 @@ LOOKS = ("as it is", "with the hand", "all of it")
 
 
 class Borrowed:
-    """A scene model that draws `lender`'s robot where that of `env` is: the hand alone, or `arm`
-    and hand. Attributes are those of `env`'s own."""
+    """A `SceneModel` of `env` that draws `lender`'s robot where its own is: the hand alone, or
+    `arm` and hand. Call it as that, with geoms [G, 3] metres and [G, 3, 3] of `env`, for a `Scene`
+    of one world; attributes are those of `env`'s own."""
 
     def __init__(self, env: Env, lender: Env, *, arm: bool) -> None:
         self._own, self._env, self._lender = env.scene_model, env, lender
@@ -46,7 +47,7 @@ class Borrowed:
         is_hand = lender.scene_model.hand[self._rows]
         self._ids = tuple(np.where(is_hand, own_hand, own_arm).tolist())
         self._anchor, self._to_tcp = _anchor(env.mj_model)
-        self._shut = _gap(env, env.robot.gripper_closed)
+        self._pads_closed = _gap(env, env.robot.gripper_closed)
 
     def __getattr__(self, name: str) -> object:
         return getattr(self._own, name)
@@ -57,7 +58,7 @@ class Borrowed:
         pads = geom_xpos[np.array([self._env.mj_model.geom(n).id for n in self._env.robot.pads])]
         xpos, xmat = self._poses(
             _pose(geom_xpos[self._anchor], geom_xmat[self._anchor]) @ self._to_tcp,
-            jnp.linalg.norm(pads[0] - pads[1]) - self._shut,
+            jnp.linalg.norm(pads[0] - pads[1]) - self._pads_closed,
         )
         looks = dataclasses.replace(
             self._lender.default_params(),
@@ -147,7 +148,7 @@ def looking_like(env: Env, lender: Env, *, arm: bool) -> Env:
 
 
 def runner(task: str, robot: str, other: str, look: str, name: str, *, worlds: int) -> Runner:
-    """Of the robot `name`; `other` is drawn in one of `LOOKS` with the hand or arm of `robot`."""
+    """The runner of the robot `name`, drawn as it is, or, if it is `other`, in one of `LOOKS`."""
     env = registry.make(task, name)
     if name == other and look != LOOKS[0]:
         env = looking_like(env, registry.make(task, robot), arm=look == LOOKS[2])
@@ -166,7 +167,7 @@ def main() -> None:
     options = parser.parse_args()
 
     from palm_jax.train import workspace
-    from palm_jax.train.evaluate import Runners, record, scene_key
+    from palm_jax.train.evaluate import Runners
 
     made: dict[tuple[str, ...], Runners] = {}
     for run in options.runs:
@@ -181,14 +182,13 @@ def main() -> None:
             if robot == config.robot:
                 parser.error(f"{options.domain}: expected a domain with another robot than {robot}")
             evaluator, policy = workspace.load_policy(run, runners)
-            params = evaluator.scenes(
+            found = evaluator.domain(
+                policy,
                 options.domain,
                 seed=config.eval_seed,
                 count=options.scenes,
                 aligned=workspace.quoted_variant(run) == "aligned",
             )
-            scenes = scene_key(config.eval_seed, options.domain)
-            found = record(evaluator.episodes(policy, scenes, params, options.scenes, robot=robot))
             solved = f"{found.solved.sum()} of {len(found.solved)} solved"
             drawn = "as it is" if look == LOOKS[0] else f"{look} drawn as the {config.robot}'s"
             print(f"{run}: {solved}, the {robot} {drawn}", flush=True)
