@@ -66,7 +66,15 @@ class SimulatedRobot:
     """
 
     def __init__(
-        self, task: str, robot: str, domain: str, *, size: tuple[int, int], focal: float, seed: int
+        self,
+        task: str,
+        robot: str,
+        domain: str,
+        *,
+        size: tuple[int, int],
+        focal: float,
+        seed: int,
+        aligned: bool = True,
     ) -> None:
         import jax
 
@@ -78,6 +86,7 @@ class SimulatedRobot:
         self.env = make(task, robot)
         self.runner = Runner(self.env, worlds=1)
         self.seed, self.domain, self.solved = seed, domain, False
+        self.aligned = aligned  # whether the hand's initial yaw turns with the camera
         height, width = size
         self.K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
 
@@ -109,7 +118,8 @@ class SimulatedRobot:
         drawn = shifts.scenes(
             jax.random.fold_in(key, 2**32 - 1), self.env.default_params(), self.domain, scenes
         )
-        self.params = take_params(shifts.aligned_hand(drawn), np.array([scene]))
+        drawn = shifts.aligned_hand(drawn) if self.aligned else drawn
+        self.params = take_params(drawn, np.array([scene]))
         self.state = self.runner.reset(jax.random.fold_in(key, scene)[None], self.params)
         self.solved = False
 
@@ -140,7 +150,7 @@ def main() -> None:
     parser.add_argument("--server", help="HOST:PORT; by default the policy runs in this process")
     parser.add_argument("--episodes", type=int, default=24)
     parser.add_argument("--domain", default="in_domain", help="of the scenes")
-    parser.add_argument("--robot", default="", help="by default the one that was trained with")
+    parser.add_argument("--robot", default="", help="by default that of the domain's evaluation")
     parser.add_argument("--image-size", type=int, nargs=2, default=(480, 640))
     parser.add_argument("--focal", type=float, default=440.0, help="pixels")
     parser.add_argument("--zoom", type=float, default=1.0, help="see palm_jax.policy.load")
@@ -150,9 +160,11 @@ def main() -> None:
     # The task and its scenes are the simulator's part: a robot has its own.
     from pathlib import Path
 
-    from palm_jax.train.workspace import stored_config
+    from palm_jax.envs import shifts
+    from palm_jax.train.workspace import quoted_variant, stored_config
 
     config = stored_config(Path(words.run))
+    own = config.second_robot if shifts.other_robot(words.domain) else config.robot
     if words.server:
         from palm_jax.policy_client import PolicyClient
 
@@ -164,11 +176,12 @@ def main() -> None:
         policy = load(words.run, image_size=size, zoom=words.zoom)
     robot = SimulatedRobot(
         config.task,
-        words.robot or config.robot,
+        words.robot or own,
         words.domain,
         size=size,
         focal=words.focal,
         seed=config.eval_seed,
+        aligned=quoted_variant(Path(words.run)) == "aligned",
     )
     solved = 0
     for episode in range(words.episodes):

@@ -18,6 +18,9 @@ from palm_jax.train.learner import LearnerConfig
 
 AnyConfig = TypeVar("AnyConfig", bound="Learning")
 
+SELECTION_SEED = 500
+"""Of the scenes that score checkpoints: never those of an evaluation."""
+
 
 class ConfigError(ValueError):
     """A command that cannot be run; the message says what was expected, what came, what to do."""
@@ -201,6 +204,11 @@ class Config(Learning):
                 f"{dataclasses.replace(self, other_robot='').second_robot!r}"
             )
         _check_domains(self.domains)
+        if self.eval_seed == SELECTION_SEED:
+            raise ConfigError(
+                f"eval_seed: {SELECTION_SEED} is that of the scenes by which checkpoints are "
+                "chosen; an evaluation there would flatter, take another one"
+            )
         for name in ("demos", "scenes", "select_scenes"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name}: expected at least 1, got {getattr(self, name)}")

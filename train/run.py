@@ -25,7 +25,7 @@ from palm_jax.train import (
     transforms,
     workspace,
 )
-from palm_jax.train.config import Config, ConfigError, default_out
+from palm_jax.train.config import SELECTION_SEED, Config, ConfigError, default_out
 from palm_jax.train.evaluate import (
     VIEW,
     Evaluator,
@@ -47,7 +47,6 @@ _FILMED = ("workspace+viewpoint", "workspace+viewpoint+embodiment")
 """Domains of which videos are made, where they are evaluated."""
 
 _TRANSFORM_KEY = 1 << 20  # apart from the keys of the demonstrations
-_SELECTION_SEED = 500  # scenes that score checkpoints: never those of the evaluation
 
 
 def execute(config: Config, console: Console) -> Path:
@@ -309,7 +308,7 @@ def _training(config: Config, evaluator: Evaluator, folder: Path) -> training.Tr
         found = evaluator.domain(
             model.policy_state(state),
             "in_domain",
-            seed=_SELECTION_SEED,
+            seed=SELECTION_SEED,
             count=config.select_scenes,
             aligned=False,
         )

@@ -9,22 +9,20 @@ once for each task. Finished cells go into one JSON file at once:
     "nan"}}}}}, "failed": {task: {method: {seed: log}}}, "times": {...}, "demonstrations": {...}}
 
 The header says under which conditions; a file with another one is not touched. `demonstrations` has
-the SHA-256 of what each policy was trained on, `times` how long it took, both laid out alike. The
-episodes one by one lie in an .npz file beside it, laid out like eval.npz with
-TASK/METHOD/SEED/DOMAIN for names. `--page` makes Markdown and figures of the
-two.
+the SHA-256 of what each policy was trained on, `times` how long it took, `commits` by which code,
+`hands` what the method solved in each variant of the hand's initial yaw and which one `results`
+quotes; all laid out alike. The episodes one by one lie in an .npz file beside it (`files.tables`).
+`--page` makes Markdown and figures of the two.
 """
 
 import dataclasses
 import datetime
-import hashlib
-import json
 import os
 import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,11 +34,12 @@ from palm_jax.envs.shifts import DOMAINS
 from palm_jax.train import config as configuration
 from palm_jax.train import demos, methods, workspace
 from palm_jax.train.config import Config, ConfigError
-from palm_jax.train.files import locks, records, shards, versions
-from palm_jax.train.files.metrics import plain, write_json
+from palm_jax.train.files import locks, records, shards, tables, versions
+from palm_jax.train.files.metrics import plain
+from palm_jax.train.files.tables import Cell
 from palm_jax.train.host import compiled, interrupts
 from palm_jax.train.reporting import console as terminal
-from palm_jax.train.reporting import table_page
+from palm_jax.train.reporting import paper, table_page
 
 _FIRST = ("palm", "bc")
 """Methods whose cells come first: the claim stands and falls with them."""
@@ -74,7 +73,7 @@ class TableConfig:
     """
 
     preset: str = "cpu"
-    tasks: tuple[str, ...] = table_page.PAPER_TASKS
+    tasks: tuple[str, ...] = paper.TABLE_TASKS
     methods: tuple[str, ...] = table_page.PAPER_METHODS
     seeds: tuple[int, ...] = (0,)
     out: Path | None = None
@@ -93,18 +92,6 @@ class TableConfig:
     def file(self) -> Path:
         """`json`, its default resolved."""
         return self.json or self.folder / "table.json"
-
-
-class Cell(NamedTuple):
-    """One policy."""
-
-    task: str
-    method: str
-    seed: int
-
-    @property
-    def name(self) -> str:
-        return f"{self.task}/{self.method}-s{self.seed}"
 
 
 def cells(config: TableConfig) -> list[Cell]:
@@ -167,7 +154,6 @@ def cell_config(config: TableConfig, cell: Cell) -> Config:
 def header(config: TableConfig) -> dict[str, Any]:
     """The conditions under which the cells of a file were made."""
     preset = configuration.PRESETS[config.preset]()
-    found = workspace.environment(preset)
     recipe = {name: getattr(preset, name) for name in _KEPT} | {"other_robot": preset.second_robot}
     if preset.epochs is not None:
         del recipe["steps"]  # of each task's own demonstrations
@@ -175,10 +161,8 @@ def header(config: TableConfig) -> dict[str, Any]:
         "preset": config.preset,
         "recipe": plain(recipe),
         "domains": list(DOMAINS),
-        "versions": found["versions"],
-        "machine": found["machine"],
-        "devices": found["devices"],
-        "commit": found["commit"],
+        "versions": versions.current(),
+        **dict.fromkeys(_ORIGIN, ""),  # nothing is made yet
     }
 
 
@@ -187,7 +171,11 @@ _START_ANEW = (
     "from their folders, and other shards' merged anew"
 )
 _MUST_AGREE = ("preset", "recipe", "domains", "versions")
-_ORIGIN = ("machine", "commit")  # of those that made cells, not of those that enter or merge them
+_ORIGIN = ("machine", "devices", "commit")
+"""Of the processes that made cells, not of those that enter or merge them: this one does not even
+ask for devices, which only one process may be able to hold."""
+_PARTS = ("times", "commits", "hands", workspace.DEMONSTRATIONS)
+"""What is told of a cell beside its results."""
 
 
 def read(path: Path, fresh: dict[str, Any]) -> dict[str, Any]:
@@ -197,9 +185,9 @@ def read(path: Path, fresh: dict[str, Any]) -> dict[str, Any]:
       ConfigError: it was made under other conditions; the message names the field.
     """
     if not path.exists():
-        return {"header": {**fresh, **dict.fromkeys(_ORIGIN, "")}, "results": {}, "failed": {}}
+        return {"header": fresh, "results": {}, "failed": {}}
     try:
-        table: dict[str, Any] = records.load_json(path)
+        table = tables.load(path)
     except records.RecordError as error:
         raise records.RecordError(f"{error}: {_START_ANEW}") from error
     old = table.get("header", {})
@@ -209,19 +197,13 @@ def read(path: Path, fresh: dict[str, Any]) -> dict[str, Any]:
                 f"{path} was begun with {_difference(name, old.get(name), fresh[name])}: results "
                 "of two kinds are not mixed. Choose another --json and --out, or go back"
             )
-    if table.get("sha256", _digest(table)) != _digest(table):
-        raise records.RecordError(f"{path}: the content is not what was written: {_START_ANEW}")
+    beside = tables.episodes_file(path)
+    if table.get("results") and not beside.exists():
+        raise records.RecordError(
+            f"{path}: the episodes of its cells are expected in {beside.name} beside it, which is "
+            f"not there: put it back, or {_START_ANEW}"
+        )
     return table
-
-
-def _store(path: Path, table: dict[str, Any]) -> None:
-    write_json(path, {**table, "sha256": _digest(table)})
-
-
-def _digest(table: Mapping[str, Any]) -> str:
-    """Of a table's content, so that a digit that was changed is noticed."""
-    content = {name: value for name, value in table.items() if name != "sha256"}
-    return hashlib.sha256(json.dumps(plain(content), sort_keys=True).encode()).hexdigest()
 
 
 def _difference(name: str, old: Any, new: Any) -> str:
@@ -231,20 +213,6 @@ def _difference(name: str, old: Any, new: Any) -> str:
             if old.get(key) != new.get(key):
                 return f"{name}.{key} = {old.get(key)!r}, now it is {new.get(key)!r}"
     return f"{name} = {old!r}, now it is {new!r}"
-
-
-def _put(table: dict[str, Any], part: str, cell: Cell, value: Any) -> None:
-    row = table.setdefault(part, {}).setdefault(cell.task, {})
-    row.setdefault(cell.method, {})[str(cell.seed)] = value
-
-
-def _get(table: dict[str, Any], part: str, cell: Cell) -> Any:
-    row = table.get(part, {}).get(cell.task, {})
-    return row.get(cell.method, {}).get(str(cell.seed))
-
-
-def _drop(table: dict[str, Any], part: str, cell: Cell) -> None:
-    table.get(part, {}).get(cell.task, {}).get(cell.method, {}).pop(str(cell.seed), None)
 
 
 # -- running ---------------------------------------------------------------------------------------
@@ -261,16 +229,16 @@ def run(config: TableConfig, console: Console) -> Path:
     table = read(config.file, fresh)
     if config.merge:
         with locks.locked(config.file):
-            _merge_all(config, read(config.file, fresh), fresh)
+            _merge_all(config, read(config.file, fresh), fresh, console)
         return config.file
-    missing = [cell for cell in asked if _get(table, "results", cell) is None]
+    missing = [cell for cell in asked if tables.get(table, "results", cell) is None]
     done = len(asked) - len(missing)
     console.print(f"{len(asked)} cells, {done} done, into {config.file}", markup=False)
     took: list[float] = []
     for number, cell in enumerate(missing):
         try:
             with locks.claim(config.folder / cell.name, take_over=config.take_over):
-                if _get(read(config.file, fresh), "results", cell) is None:
+                if tables.get(read(config.file, fresh), "results", cell) is None:
                     _announce(console, cell, len(missing) - number, took)
                     _run_cell(config, cell, fresh, console, took)
         except locks.Busy as error:
@@ -287,50 +255,79 @@ def _run_cell(
     command = cell_config(config, cell)
     _check_demonstrations(command)
     code = _train(command, log)
+    try:
+        made = _made(config.folder / cell.name, fresh) if code == 0 else None
+        words = f"exit code {code}"
+    except (ConfigError, records.RecordError) as error:  # of this cell alone: others go on
+        made, words = None, str(error)
     with locks.locked(config.file):  # another process may write beside us
         table = read(config.file, fresh)
-        if code == 0 and _whole(config.folder / cell.name, console):
-            _take(table, config, cell)
+        if made is not None:
+            _enter(table, config.file, cell, made)
             took.append(time.monotonic() - start)
         else:
-            _put(table, "failed", cell, str(log))
-            words = f"{cell.name} failed (exit code {code}): see {log}"
-            console.print(words, style="bold red", markup=False)
-        _store(config.file, table)
+            tables.put(table, "failed", cell, str(log))
+            words = f"{cell.name} failed ({words}): see {log}"
+            console.print(words, style="bold red", markup=False, soft_wrap=True)
+        tables.store(config.file, table)
 
 
-def _whole(folder: Path, console: Console) -> bool:
-    """Whether a cell has left results that can be read."""
-    try:
-        records.check_counts(folder / "eval.json", records.load_eval(folder / "eval.npz"))
-    except records.RecordError as error:
-        console.print(f"{error}", markup=False)
-        return False
-    return True
+class _Made(NamedTuple):
+    """What a finished cell left in its folder."""
+
+    counts: dict[str, dict[str, int]]
+    episodes: dict[str, records.DomainRecord]
+    sessions: list[dict[str, Any]]
+    parts: dict[str, Any]  # what is known of `_PARTS`
 
 
-def _take(table: dict[str, Any], config: TableConfig, cell: Cell) -> None:
-    """What a finished cell left in its folder, into the table and the file beside it."""
-    folder = config.folder / cell.name
-    sessions = _sessions(folder)
-    _check_versions(table["header"], sessions, folder)
-    for entry in sessions:
-        _note_origin(table["header"], entry)
-    _keep_episodes(config.file, {cell: records.load_eval(folder / "eval.npz")})
-    _put(table, "results", cell, records.load_counts(folder / "eval.json"))
-    _drop(table, "failed", cell)
+def _made(folder: Path, header: Mapping[str, Any]) -> _Made:
+    """Reads the folder of a finished cell.
+
+    Raises:
+      RecordError: a file that results rest on is missing or damaged.
+      ConfigError: it was made under other versions than the table.
+    """
+    sessions = records.load_sessions(folder / "env.json")
+    _check_versions(header, sessions, folder)
+    counts = records.load_counts(folder / "eval.json")
+    episodes = records.load_eval(folder / "eval.npz")
+    records.compare_counts(folder / "eval.json", counts, episodes)
     times = records.load_notes(folder / records.TIMES)
-    if _took(times):
-        _put(table, "times", cell, times)
-    if (digest := _trained_on(folder)) is not None:
-        _put(table, workspace.DEMONSTRATIONS, cell, digest)
+    parts = {
+        "times": times if _took(times) else None,
+        "commits": "; ".join(sorted({str(e["commit"]) for e in sessions if e.get("commit")})),
+        "hands": _hands(folder),
+        workspace.DEMONSTRATIONS: _trained_on(folder),
+    }
+    known = {name: value for name, value in parts.items() if value}
+    return _Made(counts, episodes, sessions, known)
+
+
+def _enter(table: dict[str, Any], path: Path, cell: Cell, made: _Made) -> None:
+    """A finished cell, into the table and the file beside it."""
+    for entry in made.sessions:
+        _note_origin(table["header"], entry)
+    _keep_episodes(path, {cell: made.episodes})
+    tables.put(table, "results", cell, made.counts)
+    for name, value in made.parts.items():
+        tables.put(table, name, cell, value)
+    tables.drop(table, "failed", cell)
     _note_speed(table)
 
 
-def _sessions(folder: Path) -> list[dict[str, Any]]:
-    """Where, when and with what a cell was worked on."""
-    path = folder / "env.json"
-    return records.load_sessions(path) if path.exists() else []
+def _hands(folder: Path) -> dict[str, Any] | None:
+    """{"quoted": variant, "successes": {variant: {domain: n}}} of the hand's initial yaw; None for
+    a method that has but one."""
+    notes = records.load_notes(folder / "eval_variants.json")
+    quoted = notes.pop("quoted", None)
+    if quoted not in notes or len(notes) < 2:
+        return None
+    successes = {
+        variant: {domain: entry["successes"] for domain, entry in domains.items()}
+        for variant, domains in notes.items()
+    }
+    return {"quoted": quoted, "successes": successes}
 
 
 def _check_versions(
@@ -388,7 +385,7 @@ def _took(times: Mapping[str, Any]) -> tuple[float, float] | None:
 
 def _note_speed(table: dict[str, Any]) -> None:
     """Medians over the cells, into the header: samples a second, seconds of an evaluation."""
-    every = (_get(table, "times", cell) or {} for cell in _cells_of(table, "times"))
+    every = (tables.get(table, "times", cell) or {} for cell in tables.cells(table, "times"))
     took = list(filter(None, map(_took, every)))
     recipe, header = table["header"]["recipe"], table["header"]
     if took:
@@ -399,15 +396,11 @@ def _note_speed(table: dict[str, Any]) -> None:
 
 def _keep_episodes(table: Path, fresh: Mapping[Cell, Mapping[str, records.DomainRecord]]) -> None:
     """Adds the episodes of cells to those beside the table."""
-    path = table_page.episodes_file(table)
     try:
-        kept = records.load_eval(path) if path.exists() else {}
+        kept = tables.load_episodes(table)
     except records.RecordError as error:
         raise records.RecordError(f"{error}: {_START_ANEW}") from error
-    for cell, by_domain in fresh.items():
-        for domain, record in by_domain.items():
-            kept[f"{cell.task}/{cell.method}/{cell.seed}/{domain}"] = record
-    records.save_eval(path, kept)
+    tables.save_episodes(table, {**kept, **fresh})
 
 
 def _announce(console: Console, cell: Cell, left: int, took: list[float]) -> None:
@@ -475,9 +468,7 @@ def _environment() -> dict[str, str]:
     return {**ours, **os.environ}
 
 
-def _merge(
-    table: dict[str, Any], path: Path, fresh: dict[str, Any]
-) -> dict[Cell, Mapping[str, records.DomainRecord]]:
+def _merge(table: dict[str, Any], path: Path, fresh: dict[str, Any]) -> tables.Episodes:
     """Takes over what only the other file has; returns the episodes of the cells that came with
     results.
 
@@ -489,61 +480,64 @@ def _merge(
         raise ConfigError(
             f"merge: expected the JSON file of a shard, got {path}, which is not there"
         )
-    other, beside = read(path, fresh), _episodes_of(path)
-    taken: dict[Cell, Mapping[str, records.DomainRecord]] = {}
-    for cell in _cells_of(other, "results"):
-        if _get(table, "results", cell) is None:
-            counts = _get(other, "results", cell)
-            records.compare_counts(f"{path}: {cell.name}", counts, beside.get(cell, {}))
-            _put(table, "results", cell, counts)
-            for part in ("times", workspace.DEMONSTRATIONS):
-                if (value := _get(other, part, cell)) is not None:
-                    _put(table, part, cell, value)
-            _drop(table, "failed", cell)
-            taken[cell] = beside.get(cell, {})
-    for cell in _cells_of(other, "failed"):
-        if _get(table, "results", cell) is None:
-            _put(table, "failed", cell, _get(other, "failed", cell))
-    _note_origin(table["header"], other["header"])
+    other, beside = read(path, fresh), tables.load_episodes(path)
+    taken = tables.Episodes()
+    for cell in tables.cells(other, "results"):
+        if tables.get(table, "results", cell) is None:
+            tables.check_counts(path, other, cell, beside)
+            for part in ("results", *_PARTS):
+                if (value := tables.get(other, part, cell)) is not None:
+                    tables.put(table, part, cell, value)
+            tables.drop(table, "failed", cell)
+            taken[cell] = beside[cell]
+    for cell in tables.cells(other, "failed"):
+        if tables.get(table, "results", cell) is None:
+            tables.put(table, "failed", cell, tables.get(other, "failed", cell))
+    if taken:
+        _note_origin(table["header"], other["header"])
     return taken
 
 
-def _episodes_of(table: Path) -> dict[Cell, dict[str, records.DomainRecord]]:
-    """The episodes beside a table, by cell and domain; empty where there is no such file."""
-    path = table_page.episodes_file(table)
-    found: dict[Cell, dict[str, records.DomainRecord]] = {}
-    for name, record in (records.load_eval(path) if path.exists() else {}).items():
-        try:
-            task, method, seed, domain = name.split("/")
-            found.setdefault(Cell(task, method, int(seed)), {})[domain] = record
-        except ValueError as error:
-            raise records.RecordError(
-                f"{path}: expected arrays named TASK/METHOD/SEED/DOMAIN/..., got {name!r}"
-            ) from error
-    return found
+def _merge_all(
+    config: TableConfig, table: dict[str, Any], fresh: dict[str, Any], console: Console
+) -> None:
+    taken = tables.Episodes()
+    for path in config.merge:
+        found = _merge(table, path, fresh)
+        for cell in _other_results(table, tables.load(path)):
+            console.print(
+                f"{cell.name}: {path} has other results of it, which are left out: of a cell that "
+                "was run twice the first one counts",
+                markup=False,
+                soft_wrap=True,
+            )
+        taken |= found
+    _note_speed(table)
+    _keep_episodes(config.file, taken)
+    tables.store(config.file, table)
+
+
+def _other_results(table: Mapping[str, Any], other: Mapping[str, Any]) -> list[Cell]:
+    """Cells of which two tables tell different things."""
+    return [
+        cell
+        for cell in tables.cells(other, "results")
+        if tables.get(other, "results", cell) != tables.get(table, "results", cell)
+    ]
 
 
 def _note_origin(header: dict[str, Any], made: Mapping[str, Any]) -> None:
     """Adds where and by which commits results were made, as `made` has it, to a header."""
     for name in _ORIGIN:
-        words = (str(part[name]).split("; ") for part in (header, made) if part.get(name))
+        words = (_words(part.get(name)) for part in (header, made))
         header[name] = "; ".join(sorted(set().union(*words)))
 
 
-def _merge_all(config: TableConfig, table: dict[str, Any], fresh: dict[str, Any]) -> None:
-    taken: dict[Cell, Mapping[str, records.DomainRecord]] = {}
-    for path in config.merge:
-        taken |= _merge(table, path, fresh)
-    _note_speed(table)
-    _keep_episodes(config.file, taken)
-    _store(config.file, table)
-
-
-def _cells_of(table: dict[str, Any], part: str) -> Iterator[Cell]:
-    for task, row in table.get(part, {}).items():
-        for method, seeds in row.items():
-            for seed in seeds:
-                yield Cell(task, method, int(seed))
+def _words(origin: Any) -> list[str]:
+    """What a header ("a; b") or a session (one, or a list of devices) says."""
+    if not isinstance(origin, list):
+        return str(origin).split("; ") if origin else []
+    return [", ".join(map(str, origin))]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -572,9 +566,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _summary(config: TableConfig, path: Path, console: Console) -> int:
     """Tells what has failed and what is not done; returns the exit code."""
     table = records.load_json(path) if path.exists() else {}
-    failed = list(_cells_of(table, "failed"))
-    left = [] if config.merge else [c for c in cells(config) if _get(table, "results", c) is None]
-    left = [cell for cell in left if cell not in failed]
+    failed = list(tables.cells(table, "failed"))
+    asked = [] if config.merge else cells(config)
+    done = (*tables.cells(table, "results"), *failed)
+    left = [cell for cell in asked if cell not in done]
     words = f"; {len(failed)} cells failed" if failed else ""
     words += f"; {len(left)} cells are left to other processes" if left else ""
     console.print(f"Results: {path}{words}", markup=False)

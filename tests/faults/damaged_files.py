@@ -24,7 +24,7 @@ from palm_jax.envs import make
 from palm_jax.envs.base import EnvParams
 from palm_jax.train import checkpoint, demos, run, table, training, workspace
 from palm_jax.train.config import Config, ConfigError
-from palm_jax.train.files import metrics, records
+from palm_jax.train.files import metrics, records, tables
 from palm_jax.train.reporting import runs
 
 # -- checkpoints -----------------------------------------------------------------------------------
@@ -379,18 +379,24 @@ def _second_run(folder: Path) -> Outcome:
     return Outcome("refused, with both ways out")
 
 
+def _enter(content: dict[str, Any], config: table.TableConfig, cell: tables.Cell) -> None:
+    made = table._made(config.folder / cell.name, content["header"])
+    table._enter(content, config.file, cell, made)
+
+
 def _a_table(folder: Path) -> tuple[table.TableConfig, dict[str, Any]]:
     config = table.TableConfig(
         preset="quick", out=folder, tasks=("lift_lid",), methods=("palm", "bc")
     )
     fresh = table.header(config)
     content = table.read(config.file, fresh)
-    cell = table.Cell("lift_lid", "palm", 0)
+    cell = tables.Cell("lift_lid", "palm", 0)
     found = folder / cell.name
     found.mkdir(parents=True)
     _results(found)
-    table._take(content, config, cell)
-    table._store(config.file, content)
+    metrics.write_json(found / "env.json", {"sessions": []})
+    _enter(content, config, cell)
+    tables.store(config.file, content)
     return config, fresh
 
 
@@ -412,14 +418,14 @@ def _damaged_table(folder: Path, harm: Callable[[Path], Any], words: str) -> Out
     config, fresh = _a_table(folder)
     whole = snapshot(folder)
     harm(config.file)
-    cell = table.Cell("lift_lid", "palm", 0)
+    cell = tables.Cell("lift_lid", "palm", 0)
     with refused(records.RecordError, words, "move it and the .npz or .json file beside it away"):
-        table._take(table.read(config.file, fresh), config, cell)
+        _enter(table.read(config.file, fresh), config, cell)
     for path in (config.file, config.file.with_suffix(".npz")):
         path.unlink(missing_ok=True)
     content = table.read(config.file, fresh)
-    table._take(content, config, cell)
-    table._store(config.file, content)
+    _enter(content, config, cell)
+    tables.store(config.file, content)
     assert snapshot(folder) == whole
     return Outcome("named, with what to do; cells come back from their folders")
 

@@ -18,9 +18,8 @@ from faults import workers
 from faults.cases import Outcome, case, logged
 
 from palm_jax.train import checkpoint, table
-from palm_jax.train.files import locks, records
+from palm_jax.train.files import locks, records, tables
 from palm_jax.train.host import interrupts
-from palm_jax.train.reporting import table_page
 
 KILLS = 25
 _SERVER = multiprocessing.get_context("forkserver")
@@ -133,7 +132,7 @@ def _results(folder: Path) -> tuple[Any, bytes]:
     file = folder / "table.json"
     content = table.read(file, records.load_json(file)["header"])
     assert not content["failed"]
-    return content["results"], table_page.episodes_file(file).read_bytes()
+    return content["results"], tables.episodes_file(file).read_bytes()
 
 
 @case("kill -9", f"{KILLS} times in a table", long=True)
@@ -145,7 +144,7 @@ def _table(folder: Path) -> Outcome:
     assert count == KILLS, f"only {count} kills before the end"
     assert _results(expected)[0] == _results(killed)[0]
     left, right = (
-        records.load_arrays(table_page.episodes_file(f / "table.json")) for f in (expected, killed)
+        records.load_arrays(tables.episodes_file(f / "table.json")) for f in (expected, killed)
     )
     assert {name: array.tobytes() for name, array in left.items()} == {
         name: array.tobytes() for name, array in right.items()

@@ -87,6 +87,7 @@ def run_table(folder: Path) -> None:
         records.save_eval(config.out / "eval.npz", {"in_domain": episodes})
         count = {"successes": int(good.sum()), "episodes": 24, "nan": 0}
         (config.out / "eval.json").write_text(json.dumps({"in_domain": count}))
+        (config.out / "env.json").write_text("{}")
         _tell(folder, f"end {name}")
         return 0
 

@@ -133,6 +133,7 @@ def test_folders_are_named_after_what_is_in_them() -> None:
         (["--learning-rate", "-1"], "learning_rate is -1.0; expected 0 or more"),
         (["--stepps", "3"], r"unknown option --stepps \(did you mean --steps\?\); known: .*--task"),
         (["--steps", "0"], "steps: expected at least 1, got 0"),
+        (["--eval-seed", "500"], "eval_seed: 500 is that of the scenes by which checkpoints are"),
         (["--epochs", "0"], "epochs: expected more than 0, got 0.0"),
         (["--steps", "9", "--epochs", "2"], "steps and epochs = 2.0: give one of them"),
         (["--scenes=-1"], "scenes: expected at least 1, got -1"),

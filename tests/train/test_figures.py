@@ -161,8 +161,8 @@ def test_sample_distribution_marks_every_scene_once() -> None:
     index = np.clip((np.degrees(view.camera_angle) + 30) // 10, 0, 5).astype(int)
     totals = np.bincount(index, minlength=6)
     np.testing.assert_array_equal(np.add(heights[:6], heights[6:]), totals)
-    assert "camera angle   (V: 20 scenes)" in texts(figure)
-    assert "y (m)   (ID and W: 16 scenes)" in texts(figure)
+    assert "camera angle   (V: 20 episodes)" in texts(figure)
+    assert "y (m)   (ID and W: 16 episodes)" in texts(figure)
 
 
 COUNTS = {

@@ -9,6 +9,7 @@ from scipy import stats as scipy_stats
 from palm_jax.train.reporting.stats import (
     degradation,
     degradation_interval,
+    independent_episodes,
     mean_interval,
     success_rate,
     wilson_interval,
@@ -92,3 +93,29 @@ def test_mean_of_tasks_weighs_them_equally() -> None:
     below = math.hypot(0.5 - first.low, 0.25 - second.low) / 2
     above = math.hypot(first.high - 0.5, second.high - 0.25) / 2
     assert (lower, upper) == pytest.approx((mean - below, mean + above))
+
+
+def test_what_policies_in_the_same_scenes_are_worth() -> None:
+    """Against the spread of the mean when scenes are drawn anew: half of a scene's outcome is the
+    scene's, so that policies agree more often than by chance."""
+    generator = np.random.default_rng(0)
+    policies, scenes = 3, 50
+    means, worth = [], []
+    for _ in range(2000):
+        hard = generator.beta(0.5, 0.5, scenes)
+        solved = generator.random((policies, scenes)) < hard
+        means.append(solved.mean())
+        worth.append(independent_episodes(solved))
+    wanted = 0.25 / np.var(means)
+    assert np.mean(worth) == pytest.approx(wanted, rel=0.1)
+    assert wanted < 0.6 * policies * scenes
+
+
+def test_copies_are_worth_nothing_and_strangers_all() -> None:
+    one = np.arange(40) % 3 == 0
+    assert independent_episodes(one[None]) == 40
+    assert independent_episodes([one, one, one]) == pytest.approx(40)
+    # Every scene is solved by one of the two: further apart than chance.
+    assert independent_episodes([one, ~one]) == 80
+    for same in (np.zeros((3, 40)), np.ones((3, 40))):
+        assert independent_episodes(same) == 40  # nothing tells how alike they are

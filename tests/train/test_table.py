@@ -16,8 +16,7 @@ import pytest
 from palm_jax.train import config as configuration
 from palm_jax.train import table
 from palm_jax.train.config import Config, ConfigError
-from palm_jax.train.files import locks, records
-from palm_jax.train.reporting import table_page
+from palm_jax.train.files import locks, records, tables
 from palm_jax.train.table import TableConfig
 
 SMALL = TableConfig(
@@ -107,12 +106,12 @@ def test_a_shard_that_is_none_is_told(tmp_path: Path, capsys: pytest.CaptureFixt
 
 def test_a_cell_is_a_training_command(tmp_path: Path) -> None:
     config = dataclasses.replace(SMALL, out=tmp_path)
-    cell = table.cell_config(config, table.Cell("lift_spam", "arro", 1))
+    cell = table.cell_config(config, tables.Cell("lift_spam", "arro", 1))
     again = configuration.parse(configuration.command(cell)[3:])
     assert again == cell
     assert again.method == ("arro",) and again.seed == 1 and not again.sweep
     # Demonstrations are of the task alone.
-    other = table.cell_config(config, table.Cell("lift_spam", "palm", 0))
+    other = table.cell_config(config, tables.Cell("lift_spam", "palm", 0))
     assert cell.data == other.data and cell.out != other.out
 
 
@@ -170,7 +169,7 @@ def test_other_conditions_are_refused_by_name(
     for name in change[:-1]:
         place = place[name]
     place[change[-1]] = "cpu"
-    config.file.write_text(json.dumps(stored))
+    tables.store(config.file, stored)
     before = config.file.read_bytes()
     assert run(dataclasses.replace(config, methods=("bc",))) == 2
     assert words in capsys.readouterr().err
@@ -191,7 +190,7 @@ def test_shards_are_merged(tmp_path: Path, trainer: Trainer) -> None:
     every = {(task, method) for task in SMALL.tasks for method in SMALL.methods}
     assert {(t, m) for t, row in found.items() for m in row} == every
     # Episode by episode, too: each policy's are its own.
-    episodes = records.load_eval(table_page.episodes_file(whole.file))
+    episodes = records.load_eval(tables.episodes_file(whole.file))
     assert len(episodes) == len(every)
     for task, method in every:
         counted = found[task][method]["0"]["in_domain"]["successes"]
@@ -206,13 +205,13 @@ def test_what_cannot_be_merged_is_named_and_changes_nothing(
         for name in ("palm", "bc")
     )
     assert run(first) == run(second) == 0
-    beside = table_page.episodes_file(second.file)
+    beside = tables.episodes_file(second.file)
     whole = beside.read_bytes()
-    before = first.file.read_bytes(), table_page.episodes_file(first.file).read_bytes()
+    before = first.file.read_bytes(), tables.episodes_file(first.file).read_bytes()
 
     def refused(*paths: Path) -> str:
         assert run(dataclasses.replace(first, merge=paths)) == 2
-        after = first.file.read_bytes(), table_page.episodes_file(first.file).read_bytes()
+        after = first.file.read_bytes(), tables.episodes_file(first.file).read_bytes()
         assert after == before
         return " ".join(capsys.readouterr().err.split())
 
@@ -228,10 +227,10 @@ def test_what_cannot_be_merged_is_named_and_changes_nothing(
     np.savez(beside, **arrays | {name: ~arrays[name]})
     assert "lift_spam/bc-s0: in_domain: {'successes': 4" in refused(second.file)
     beside.unlink()
-    assert f"{second.file}: lift_lid/bc-s0" in refused(second.file)
+    assert "the episodes of its cells are expected in table.npz" in refused(second.file)
     beside.write_bytes(whole)
     assert run(dataclasses.replace(first, merge=(second.file,))) == 0
-    assert len(records.load_eval(table_page.episodes_file(first.file))) == 4
+    assert len(records.load_eval(tables.episodes_file(first.file))) == 4
 
 
 def test_every_cell_notes_its_demonstrations(tmp_path: Path, trainer: Trainer) -> None:
@@ -304,11 +303,100 @@ def test_a_cell_of_other_versions_is_not_entered(
     here = metadata.version("jax")
     old, now = {"versions": {"jax": "0.0.1"}}, {"versions": {"jax": here}}
     trainer.env = {"sessions": [old, now]} if kind == "one of the sessions" else old
-    assert run(config) == 2 and not config.file.exists()
-    error = " ".join(capsys.readouterr().err.split())
-    assert f"lift_lid/palm-s0 was made with jax 0.0.1, the table with {here}" in error
+    assert run(config) == 1
+    content = json.loads(config.file.read_text())
+    assert not content["results"] and set(content["failed"]) == {"lift_lid", "lift_spam"}
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"lift_lid/palm-s0 was made with jax 0.0.1, the table with {here}" in said
     trainer.env = {"sessions": [now, now]}
     assert run(config) == 0
+
+
+@pytest.mark.parametrize("name", ["env.json", "eval.json", "eval.npz"])
+def test_a_cell_that_left_a_damaged_file_costs_that_cell_alone(
+    name: str,
+    tmp_path: Path,
+    trainer: Trainer,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = dataclasses.replace(SMALL, out=tmp_path, seeds=(0,), methods=("palm",))
+
+    def damaging(asked: Config, log: Path) -> int:
+        code = trainer(asked, log)
+        if asked.task == "lift_lid":
+            assert asked.out is not None
+            (asked.out / name).write_bytes(b"{")
+        return code
+
+    monkeypatch.setattr(table, "_train", damaging)
+    assert run(config) == 1
+    content = json.loads(config.file.read_text())
+    assert set(content["results"]) == {"lift_spam"} and set(content["failed"]) == {"lift_lid"}
+    assert str(tmp_path / "lift_lid/palm-s0" / name) in capsys.readouterr().out
+    monkeypatch.setattr(table, "_train", trainer)
+    assert run(config) == 0
+
+
+def test_a_table_does_not_go_on_without_its_episodes(
+    tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = dataclasses.replace(SMALL, out=tmp_path, seeds=(0,), methods=("palm",))
+    assert run(config) == 0
+    tables.episodes_file(config.file).unlink()
+    assert run(dataclasses.replace(config, methods=("bc",))) == 2 and len(trainer.asked) == 2
+    assert "are expected in table.npz beside it" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_cell_tells_its_commit_and_both_hands(
+    tmp_path: Path, trainer: Trainer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = dataclasses.replace(SMALL, out=tmp_path / "one", seeds=(0,), methods=("bc",))
+    trainer.env = {"sessions": [{"commit": "b", "devices": ["gpu:0"]}, {"commit": "a"}]}
+
+    def varied(asked: Config, log: Path) -> int:
+        code = trainer(asked, log)
+        assert asked.out is not None
+        count = {"episodes": 24, "nan": 0}
+        variants = {
+            "quoted": "unaligned",
+            "unaligned": {"viewpoint": {"successes": 9, **count}},
+            "aligned": {"viewpoint": {"successes": 7, **count}},
+        }
+        (asked.out / "eval_variants.json").write_text(json.dumps(variants))
+        return code
+
+    monkeypatch.setattr(table, "_train", varied)
+    assert run(config) == 0
+    merged = dataclasses.replace(config, json=tmp_path / "merged.json", merge=(config.file,))
+    assert run(merged) == 0
+    for file in (config.file, merged.file):
+        content, cell = json.loads(file.read_text()), tables.Cell("lift_lid", "bc", 0)
+        assert content["header"]["devices"] == "gpu:0"
+        assert tables.get(content, "commits", cell) == "a; b"
+        assert tables.get(content, "hands", cell) == {
+            "quoted": "unaligned",
+            "successes": {"unaligned": {"viewpoint": 9}, "aligned": {"viewpoint": 7}},
+        }
+
+
+def test_of_a_cell_that_was_run_twice_the_first_one_counts(
+    tmp_path: Path, trainer: Trainer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = (
+        dataclasses.replace(SMALL, out=tmp_path / name, seeds=(0,), methods=("palm",))
+        for name in ("one", "two")
+    )
+    trainer.env = {"machine": "A"}
+    assert run(first) == 0
+    trainer.env = {"machine": "B"}
+    assert run(second) == 0
+    before = json.loads(first.file.read_text())
+    assert run(dataclasses.replace(first, merge=(second.file,))) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"lift_spam/palm-s0: {second.file} has other results of it" in said
+    after = json.loads(first.file.read_text())
+    assert after["results"] == before["results"] and after["header"]["machine"] == "A"
 
 
 def test_the_header_tells_the_speed(tmp_path: Path, trainer: Trainer) -> None:
@@ -402,7 +490,7 @@ def test_a_file_that_another_process_wrote_meanwhile_keeps_its_cells(
     assert run(config) == 0
     assert sorted(trainer.asked) == ["lift_lid/palm-s0", "lift_spam/palm-s0"]
     assert set(json.loads(config.file.read_text())["results"]) == {"lift_lid", "lift_spam"}
-    assert len(records.load_eval(table_page.episodes_file(config.file))) == 2
+    assert len(records.load_eval(tables.episodes_file(config.file))) == 2
 
 
 STUBBORN = """
@@ -421,7 +509,7 @@ def test_a_signal_lets_the_running_cell_save(
     number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = table.cell_config(
-        dataclasses.replace(SMALL, out=tmp_path), table.Cell("lift_lid", "palm", 0)
+        dataclasses.replace(SMALL, out=tmp_path), tables.Cell("lift_lid", "palm", 0)
     )
     log = tmp_path / "cell.log"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

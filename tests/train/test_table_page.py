@@ -10,8 +10,9 @@ import pytest
 
 from palm_jax.envs.shifts import DOMAINS
 from palm_jax.train import config, table
-from palm_jax.train.files import records
-from palm_jax.train.reporting import table_page
+from palm_jax.train.files import records, tables
+from palm_jax.train.files.tables import Cell
+from palm_jax.train.reporting import paper, table_page
 from palm_jax.train.table import TableConfig
 
 METHODS = ("palm", "bc")
@@ -41,15 +42,19 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             found = {domain: record(generator, 20) for domain in DOMAINS}
             row = content["results"].setdefault(task, {}).setdefault(method, {})
             row[seed] = records.counts(found)
-            episodes |= {f"{task}/{method}/{seed}/{domain}": r for domain, r in found.items()}
+            episodes[Cell(task, method, int(seed))] = found
     content["failed"] = {"lift_lid": {"arro": {"0": "arro.log"}}}
     content["demonstrations"] = {
         "lift_lid": {"palm": {"0": "a" * 64, "1": "b" * 64}, "bc": {"0": "a" * 64}},
         "insert_peg": {"palm": {"0": "c" * 64, "1": "c" * 64}},
     }
     path = folder / "table.json"
+    successes = {domain: 12 for domain in DOMAINS}
+    variants = {"aligned": successes, "unaligned": successes | {"viewpoint": 10}}
+    hands = {"quoted": "aligned", "successes": variants}
+    content["hands"] = {"lift_lid": {"bc": {"0": hands}}}
     path.write_text(json.dumps(content))
-    records.save_eval(table_page.episodes_file(path), episodes)
+    tables.save_episodes(path, episodes)
     return path
 
 
@@ -76,11 +81,25 @@ def test_every_policy_has_its_counts(page: str, made: Path) -> None:
                 assert re.search(r"\| " + cells[0] + r" \([^|]*\| " + " | ".join(cells[1:]), page)
 
 
+def test_each_seed_is_told_where_there_are_several() -> None:
+    def counts(good: int, shifted: int) -> dict[str, dict[str, int]]:
+        solved = dict.fromkeys(DOMAINS, shifted) | {"in_domain": good}
+        return {d: {"successes": n, "episodes": 20, "nan": 0} for d, n in solved.items()}
+
+    several = {"0": counts(20, 15), "1": counts(10, 10), "2": counts(20, 20)}
+    results = {task: {"palm": several, "bc": {"0": counts(20, 0)}} for task in paper.TABLE_TASKS}
+    results["lift_lid"] = {"palm": {"0": counts(20, 20), "1": counts(1, 0)}, "bc": {}}
+    lines = table_page._seeds({"results": results}).splitlines()
+    # A quarter on three tasks of four; and of three tasks, as one is not done at all.
+    assert lines[2:] == ["| PALM | 0 | 1.00 | 0.19 |", "| PALM | 1 | 0.39 | 0.00 |"]
+    assert table_page._seeds({"results": {}}) == ""
+
+
 def test_who_learns_nothing_has_nothing_to_lose() -> None:
     def row(solved: int) -> list[str]:
         counts = {domain: {"successes": 0, "episodes": 20, "nan": 0} for domain in DOMAINS}
         counts["in_domain"]["successes"] = solved
-        return table_page._policy({"preset": "cpu"}, "lift_lid", "bc", "0", counts)
+        return table_page._policy({"preset": "cpu"}, Cell("lift_lid", "bc", 0), counts, None)
 
     assert row(1)[-2] == "-" and row(2)[-2] == "1.00"
 
@@ -93,7 +112,7 @@ def test_the_command_beside_a_policy_is_its_own(page: str) -> None:
         for task in ("lift_lid", "insert_peg")
         for method, seed in (("palm", 0), ("palm", 1), ("bc", 0))
     }
-    wanted = table.cell_config(TableConfig(preset="quick"), table.Cell("lift_lid", "bc", 0))
+    wanted = table.cell_config(TableConfig(preset="quick"), Cell("lift_lid", "bc", 0))
     same = next(c for c in parsed if c.task == "lift_lid" and c.method == ("bc",))
     for name in ("demo_seed", "eval_seed", "domains", "steps", "sweep", "scenes"):
         assert getattr(same, name) == getattr(wanted, name)
@@ -108,6 +127,47 @@ def test_collections_of_several_machines_are_counted(page: str) -> None:
     assert "there are 2 collections of Lift Lid. The JSON" in page
 
 
+def test_the_hand_that_is_quoted_is_told_with_the_other(page: str) -> None:
+    lines = [
+        line.split(" | ")[:3]
+        for line in page.splitlines()
+        if line.startswith(("| BC |", "| PALM |"))
+    ]
+    assert [line[2] for line in lines if len(line) == 3 and line[1] in "01"] == [
+        "-", "-", "aligned: 96 (unaligned: 94)", "-", "-", "-",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", ["a digit", "another sum", "no episodes", "a foreign name"])
+def test_what_does_not_fit_together_is_not_published(
+    damage: str, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, page = tmp_path / "table.json", tmp_path / "page.md"
+    content, episodes = json.loads(made.read_text()), tables.load_episodes(made)
+    counts = content["results"]["lift_lid"]["bc"]["0"]["viewpoint"]
+    good = counts["successes"]
+    if damage != "another sum":
+        tables.store(path, content)
+    if damage == "a digit":
+        path.write_text(path.read_text().replace('"episodes": 20', '"episodes": 21', 1))
+        words = "table.json: the content is not what was written"
+    elif damage == "another sum":
+        counts["successes"] = good + 1 if good < 20 else good - 1
+        tables.store(path, content)
+        words = "table.json: lift_lid/bc-s0: viewpoint"
+    elif damage == "no episodes":
+        words = "table.json: lift_lid/palm-s0: in_domain"
+    else:
+        words = "expected arrays named TASK/METHOD/SEED/DOMAIN/..., got 'viewpoint'"
+    if damage == "a foreign name":
+        some = episodes[Cell("lift_lid", "bc", 0)]["viewpoint"]
+        records.save_eval(tables.episodes_file(path), {"viewpoint": some})
+    elif damage != "no episodes":
+        tables.save_episodes(path, episodes)
+    assert table.main(["--json", str(path), "--page", str(page)]) == 2
+    assert words in capsys.readouterr().err and not page.exists()
+
+
 def test_what_failed_is_said(page: str) -> None:
     assert "Failed, and in no number above: Lift Lid, ARRO, seed 0." in page
 
@@ -119,7 +179,7 @@ def test_the_figures_are_there(page: str, made: Path) -> None:
 
 
 def test_episodes_of_seeds_are_joined(made: Path) -> None:
-    found = table_page.load_episodes(table_page.episodes_file(made))
+    found = table_page._joined(tables.load_episodes(made))
     assert found["lift_lid"]["palm"]["workspace"].episodes == 40
     assert found["lift_lid"]["bc"]["workspace"].episodes == 20
 

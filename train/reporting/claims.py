@@ -4,7 +4,8 @@ Every question is a difference (or several) that the claim says is positive. Suc
 Beta posteriors under Jeffreys' prior, independent over cells; a claim holds when the central 95 %
 of every difference lies above zero, does not when that of any lies below, and is undecided
 otherwise. Losses of two methods are compared on the tasks that both of them can do. Scenes are what
-is resampled: the spread between training seeds is not in it.
+is resampled: the spread between training seeds is not in it, and policies that were tried in the
+same scenes count as the scenes that they are worth (`stats.independent_episodes`).
 """
 
 import zlib
@@ -12,11 +13,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from palm_jax.train.reporting import paper, stats
 
 Counts = Mapping[str, Mapping[str, int]]  # domain -> successes, episodes, nan
-Rows = Mapping[str, Mapping[str, Counts]]  # task -> method -> counts, seeds summed
+Summed = Mapping[str, Mapping[str, float]]  # the same of several seeds, with what they are worth
+Rows = Mapping[str, Mapping[str, Summed]]  # task -> method -> seeds summed
 
 LEAST_IN_DOMAIN = 0.1
 """A policy that solves less in-domain has nothing to lose: that task is left out of its losses."""
@@ -55,13 +58,14 @@ class Posterior:
         """Share solved in one cell, and draws [D] of its true value."""
         domain = next(d for d in self._rows[task][method] if paper.domain_key(d) == key)
         entry = self._rows[task][method][domain]
-        good, total = entry["successes"], entry["episodes"]
+        rate, worth = entry["successes"] / entry["episodes"], entry["independent"]
         where = (task, method, key)
         if where not in self._draws:
             # A stream of its own: an interval must not move when another cell is added.
             generator = np.random.default_rng([self._seed, zlib.crc32("/".join(where).encode())])
-            self._draws[where] = generator.beta(good + 0.5, total - good + 0.5, _DRAWS)
-        return good / total, self._draws[where]
+            good = rate * worth
+            self._draws[where] = generator.beta(good + 0.5, worth - good + 0.5, _DRAWS)
+        return rate, self._draws[where]
 
     def tasks(self, method: str) -> list[str]:
         """Tasks that the method's losses are means over, see `LEAST_IN_DOMAIN`."""
@@ -96,9 +100,9 @@ class Posterior:
         return [task for task in self.tasks(method) if task in self.tasks(other)]
 
     def where(self, tasks: Sequence[str]) -> str:
-        """ " on Lift Lid and Lift Spam"; nothing if these are all tasks."""
+        """ " on Lift Lid and Lift Spam"; nothing if these are all tasks of the paper's table."""
         names = " and ".join(map(paper.task_label, tasks)) or "no task"
-        return f" on {names}" if len(tasks) < len(self._rows) else ""
+        return "" if set(tasks) == set(paper.TABLE_TASKS) else f" on {names}"
 
     def mean_loss(self, method: str) -> tuple[float, np.ndarray]:
         """Over the seven shifted domains."""
@@ -211,6 +215,11 @@ def _c6(p: Posterior) -> list[Question]:
     ]
 
 
+def _for_it(question: Question) -> tuple[bool, float]:
+    """Least in the domain that decides on an "anywhere": one that refutes it, if there is one."""
+    return question.difference.high >= 0, question.difference.low
+
+
 _OWN = (("mirrorduo", "W"), ("roviaug", "V"), ("arro", "E"))
 
 
@@ -227,8 +236,7 @@ def _c7(p: Posterior) -> list[Question]:
             )
             for key in paper.OOD_DOMAINS
         ]
-        # "Anywhere": the domain that speaks most against it decides.
-        questions.append(min(every, key=lambda question: question.difference.low))
+        questions.append(min(every, key=_for_it))
     return questions
 
 
@@ -265,8 +273,7 @@ def judge(rows: Rows) -> list[Claim]:
     """The paper's claims C1 to C9 of its main table.
 
     Args:
-      rows: task -> method -> domain -> counts, seeds summed. A claim about a method that is not on
-        every task is "not run".
+      rows: see `summed`. A claim about a method that is not on every task is "not run".
     """
     posterior = Posterior(rows)
     claims = []
@@ -287,19 +294,35 @@ def _verdict(questions: Sequence[Question]) -> str:
     return "undecided"
 
 
-def summed(seeds: Mapping[str, Counts]) -> dict[str, dict[str, int]]:
-    """Counts of one method on one task, over its seeds."""
-    total: dict[str, dict[str, int]] = {}
+def summed(
+    seeds: Mapping[str, Counts], solved: Mapping[str, Sequence[ArrayLike]]
+) -> dict[str, dict[str, float]]:
+    """Counts of one method on one task, over its seeds.
+
+    Args:
+      seeds: seed -> domain -> counts.
+      solved: domain -> for each seed whether it solved scene n [N]; the same scenes for all.
+
+    Returns:
+      domain -> counts, and "independent": the scenes that these episodes are worth.
+    """
+    total: dict[str, dict[str, float]] = {}
     for counts in seeds.values():
         for domain, entry in counts.items():
             so_far = total.setdefault(domain, dict.fromkeys(entry, 0))
             for name, value in entry.items():
                 so_far[name] += value
+    for domain, so_far in total.items():
+        so_far["independent"] = stats.independent_episodes(np.array(solved[domain]))
     return total
+
+
+def rate(counts: Counts, key: str) -> float:
+    """Success of one policy in one domain."""
+    entry = next(entry for domain, entry in counts.items() if paper.domain_key(domain) == key)
+    return entry["successes"] / entry["episodes"]
 
 
 def loss(counts: Counts, key: str) -> float:
     """1 - success / in-domain success of one policy in one domain, NaN without the latter."""
-    by_key = {paper.domain_key(domain): entry for domain, entry in counts.items()}
-    rates = [by_key[k]["successes"] / by_key[k]["episodes"] for k in (key, "ID")]
-    return float(stats.degradation(*rates))
+    return float(stats.degradation(rate(counts, key), rate(counts, "ID")))

@@ -48,6 +48,9 @@ TASKS: dict[str, str] = {
     "stack": "Stack",
 }
 
+TABLE_TASKS = ("lift_lid", "lift_spam", "insert_peg", "rearrange_veggies")
+"""The rows of Table I, whose means it prints."""
+
 # Table I: in-domain success, then normalised degradation per domain in the order of OOD_DOMAINS.
 _TABLE_I: dict[str, tuple[float, ...]] = {
     "mirrorduo": (0.47, 0.33, 0.52, 0.60, 0.61, 0.67, 0.70, 0.65),

@@ -58,6 +58,30 @@ def wilson_interval(
     return np.where(total > 0, lower, 0.0), np.where(total > 0, upper, 1.0)
 
 
+def independent_episodes(solved: ArrayLike) -> float:
+    """How many independent scenes several policies' episodes in the same scenes are worth.
+
+    Scenes that are hard for one policy tend to be hard for the next, so that K policies in N scenes
+    tell less than K N scenes would. Kish's design effect: the variance that the overall rate has
+    over scenes, beside the binomial one. Where all succeed or all fail nothing is known of it, and
+    the scenes count once.
+
+    Args:
+      solved: [K, N], policy k in scene n.
+
+    Returns:
+      between N (the policies agree everywhere) and K N (they agree by chance).
+    """
+    each = np.asarray(solved, float)
+    policies, scenes = each.shape
+    rate, over_scenes = each.mean(), each.mean(axis=0)
+    if policies == 1 or scenes == 1 or rate in (0.0, 1.0):
+        return float(scenes)
+    spread = np.var(over_scenes, ddof=1)
+    worth = rate * (1 - rate) * scenes / spread if spread > 0 else np.inf
+    return float(np.clip(worth, scenes, policies * scenes))
+
+
 def degradation(out_of_domain: ArrayLike, in_domain: ArrayLike) -> Array:
     """The paper's normalised degradation, 1 - ood / id; lower is better, negative is a gain.
 

@@ -2,26 +2,26 @@
 numbers beside ours. Everything comes from the file and the episodes beside it; nothing is run."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from palm_jax.train.files import records
+from numpy.typing import ArrayLike
+
+from palm_jax.train.files import records, tables
 from palm_jax.train.files.metrics import write_atomic
 from palm_jax.train.files.records import DomainRecord, RecordError
+from palm_jax.train.files.tables import Cell
 from palm_jax.train.reporting import claims, figures, grids, paper, stats
 from palm_jax.train.reporting.runs import regions_of
 
-Episodes = dict[str, dict[str, dict[str, DomainRecord]]]  # task -> method -> domain
-
 _COLUMNS = tuple(paper.DOMAINS)
 
-PAPER_TASKS = ("lift_lid", "lift_spam", "insert_peg", "rearrange_veggies")
 PAPER_METHODS = (
     "palm", "bc", "palm-crop", "palm-overlay", "palm-aug", "palm-prop", "mirrorduo", "roviaug",
     "arro",
 )  # fmt: skip
-"""Rows and columns of the paper's table."""
+"""Columns of the paper's table."""
 
 
 def markers(preset: str) -> tuple[str, str]:
@@ -50,12 +50,28 @@ def _interval(found: claims.Estimate) -> str:
     return f"{_number(found.value)} ({_number(found.low)} to {_number(found.high)})"
 
 
-def rows_of(table: Mapping[str, Any]) -> dict[str, dict[str, dict[str, dict[str, int]]]]:
-    """task -> method -> domain -> counts, seeds summed."""
+def rows_of(table: Mapping[str, Any], episodes: tables.Episodes) -> claims.Rows:
+    """The tasks of the paper's table: task -> method -> counts, seeds summed."""
     return {
-        task: {method: claims.summed(seeds) for method, seeds in row.items() if seeds}
-        for task, row in table["results"].items()
+        task: {
+            method: claims.summed(seeds, _solved(episodes, task, method, seeds))
+            for method, seeds in table["results"][task].items()
+            if seeds
+        }
+        for task in paper.TABLE_TASKS
+        if table["results"].get(task)
     }
+
+
+def _solved(
+    episodes: tables.Episodes, task: str, method: str, seeds: Iterable[str]
+) -> dict[str, list[ArrayLike]]:
+    """Domain -> for each seed whether it solved scene n [N]."""
+    found: dict[str, list[ArrayLike]] = {}
+    for seed in seeds:
+        for domain, record in episodes[Cell(task, method, int(seed))].items():
+            found.setdefault(domain, []).append(record.solved)
+    return found
 
 
 # -- parts of the page -----------------------------------------------------------------------------
@@ -76,10 +92,20 @@ def _conditions(header: Mapping[str, Any]) -> str:
 
 _INTERVALS = (
     "In brackets are central 95 % intervals of posteriors (Jeffreys' prior; in the tables of tasks "
-    "Wilson's). They are about scenes: how much one training differs from the next is not in them. "
-    "A task of which a method solves less than a tenth in-domain is in none of its losses, and two "
-    "methods are compared on the tasks that are left of both."
+    "Wilson's). They are about scenes: how much one training differs from the next is not in them, "
+    "and seeds, which are tried in the same scenes, count as the scenes that they are worth: with "
+    "three seeds between 50 and 150, as they agree or not. A task of which a method solves less "
+    "than a tenth in-domain, its seeds together, is in none of its losses, and two methods are "
+    "compared on the tasks that are left of both."
 )
+
+
+_CAPTIONS = {
+    "samples": "Every episode of BC and PALM, seeds together: where the object lay (in-domain and "
+    "workspace), and how far the camera was turned (viewpoint).",
+    "heatmaps": "Percent solved over where the object lay, in-domain and workspace, seeds "
+    "together; below it solved of played.",
+}
 
 
 def _length(recipe: Mapping[str, Any]) -> str:
@@ -118,6 +144,28 @@ def _means(rows: claims.Rows) -> str:
     return markdown(["", "success ID", *(f"loss {label}" for label in labels), "mean loss"], body)
 
 
+def _seeds(table: Mapping[str, Any]) -> str:
+    """The means again, of each training seed that a method has on every task; nothing where no
+    method has two."""
+    body = []
+    for method in paper.ordered_methods(list(PAPER_METHODS)):
+        by_task = [table["results"].get(t, {}).get(method, {}) for t in paper.TABLE_TASKS]
+        shared = sorted(set.intersection(*map(set, by_task)), key=int)
+        for seed in shared if len(shared) > 1 else ():
+            counts = [row[seed] for row in by_task]
+            rates = [claims.rate(c, "ID") for c in counts]
+            losses = [
+                claims.loss(c, key)
+                for c, rate in zip(counts, rates, strict=True)
+                for key in paper.OOD_DOMAINS
+                if rate >= claims.LEAST_IN_DOMAIN
+            ]
+            lost = sum(losses) / len(losses) if losses else math.nan
+            mean = sum(rates) / len(rates)
+            body.append([paper.method_label(method), seed, _number(mean), _number(lost)])
+    return markdown(["", "seed", "success ID", "mean loss"], body) if body else ""
+
+
 def _claims(rows: claims.Rows) -> str:
     body = []
     for claim in claims.judge(rows):
@@ -126,33 +174,44 @@ def _claims(rows: claims.Rows) -> str:
     return markdown(["", "the paper's claim", "here", "differences, above zero as claimed"], body)
 
 
-def _task(header: Mapping[str, Any], task: str, row: Mapping[str, Any]) -> str:
+def _task(table: Mapping[str, Any], task: str) -> str:
     """Every policy of a task: what it solved, and the command that repeats it."""
-    body = []
+    header, row, body = table["header"], table["results"][task], []
     for method in paper.ordered_methods([name for name, seeds in row.items() if seeds]):
         for seed, counts in sorted(row[method].items(), key=lambda item: int(item[0])):
-            body.append(_policy(header, task, method, seed, counts))
+            cell = Cell(task, method, int(seed))
+            body.append(_policy(header, cell, counts, tables.get(table, "hands", cell)))
     labels = [paper.domain_label(key) for key in _COLUMNS]
-    return markdown(["method", "seed", *labels, "mean loss", "command"], body)
+    return markdown(["method", "seed", "hand", *labels, "mean loss", "command"], body)
 
 
 def _policy(
-    header: Mapping[str, Any], task: str, method: str, seed: str, counts: claims.Counts
+    header: Mapping[str, Any], cell: Cell, counts: claims.Counts, hands: Mapping[str, Any] | None
 ) -> list[str]:
     by_key = {paper.domain_key(domain): entry for domain, entry in counts.items()}
     cells = [f"{by_key[key]['successes']}/{by_key[key]['episodes']}" for key in _COLUMNS]
     base = by_key["ID"]
     low, high = stats.wilson_interval(base["successes"], base["episodes"])
     cells[0] += f" ({100 * low:.0f} to {100 * high:.0f} %)"
-    learned = base["successes"] >= claims.LEAST_IN_DOMAIN * base["episodes"]
+    learned = claims.rate(counts, "ID") >= claims.LEAST_IN_DOMAIN
     losses = [claims.loss(counts, key) if learned else math.nan for key in paper.OOD_DOMAINS]
     nan = sum(entry["nan"] for entry in counts.values())
-    name = paper.method_label(method) + (f", {nan} diverged" if nan else "")
+    name = paper.method_label(cell.method) + (f", {nan} diverged" if nan else "")
     command = (
-        f"`python -m palm_jax.train --preset {header['preset']} --task {task} --method {method} "
-        f"--seed {seed} --no-sweep`"
+        f"`python -m palm_jax.train --preset {header['preset']} --task {cell.task} "
+        f"--method {cell.method} --seed {cell.seed} --no-sweep`"
     )
-    return [name, seed, *cells, _number(sum(losses) / len(losses)), command]
+    return [name, str(cell.seed), _hand(hands), *cells, _number(sum(losses) / len(losses)), command]
+
+
+def _hand(hands: Mapping[str, Any] | None) -> str:
+    """Which variant of the hand's initial yaw is quoted, and what the others solved in all."""
+    if hands is None:
+        return "-"
+    total = {name: sum(domains.values()) for name, domains in hands["successes"].items()}
+    quoted = hands["quoted"]
+    others = (f"{name}: {count}" for name, count in total.items() if name != quoted)
+    return f"{quoted}: {total[quoted]} ({', '.join(others)})"
 
 
 def _missing(table: Mapping[str, Any]) -> list[str]:
@@ -161,11 +220,11 @@ def _missing(table: Mapping[str, Any]) -> list[str]:
     for method in PAPER_METHODS:
         tasks = [
             paper.task_label(task)
-            for task in PAPER_TASKS
+            for task in paper.TABLE_TASKS
             if not table["results"].get(task, {}).get(method)
         ]
         if tasks:
-            where = "every task" if len(tasks) == len(PAPER_TASKS) else ", ".join(tasks)
+            where = "every task" if len(tasks) == len(paper.TABLE_TASKS) else ", ".join(tasks)
             lines.append(f"{paper.method_label(method)} ({where})")
     return lines
 
@@ -177,16 +236,25 @@ def _failed(table: Mapping[str, Any]) -> Iterator[str]:
                 yield f"{paper.task_label(task)}, {paper.method_label(method)}, seed {seed}"
 
 
-def text(table: Mapping[str, Any], drawn: Mapping[str, Sequence[str]]) -> str:
+def text(
+    table: Mapping[str, Any], episodes: tables.Episodes, drawn: Mapping[str, Sequence[str]]
+) -> str:
     """What stands between the markers.
 
     Args:
       table: content of the JSON file.
+      episodes: of the file beside it.
       drawn: task -> paths of its figures, relative to the page.
     """
-    rows, header = rows_of(table), table["header"]
+    rows, header = rows_of(table, episodes), table["header"]
     parts = [f"## The main table, preset `{header['preset']}`", _cell(_conditions(header))]
     parts += ["### Means over the tasks", _INTERVALS, _means(rows)]
+    if seeds := _seeds(table):
+        parts += [
+            "Each training seed by itself, a task that it does not do in-domain left out of its "
+            "loss:",
+            seeds,
+        ]
     parts += ["### The claims", _claims(rows)]
     missing, failed, collections = _missing(table), list(_failed(table)), _collections(table)
     if collections:
@@ -200,29 +268,24 @@ def text(table: Mapping[str, Any], drawn: Mapping[str, Sequence[str]]) -> str:
         parts.insert(1, f"Not complete: {'; '.join(missing)} not run yet.")
     if failed:
         parts.append(f"Failed, and in no number above: {_cell('; '.join(failed))}.")
-    for task, row in table["results"].items():
-        parts += [f"### {_cell(paper.task_label(task))}", _task(header, task, row)]
-        parts += [f"![{Path(path).stem}]({path})" for path in drawn.get(task, ())]
+    for task in table["results"]:
+        parts += [f"### {_cell(paper.task_label(task))}", _task(table, task)]
+        for path in drawn.get(task, ()):
+            kind = Path(path).stem.partition("_")[0]
+            parts += [f"![{Path(path).stem}]({path})", f"*{_CAPTIONS[kind]}*"]
     return "\n\n".join(parts)
 
 
 # -- figures ---------------------------------------------------------------------------------------
 
 
-def episodes_file(table: Path) -> Path:
-    """Where the episodes of a table's file are kept."""
-    return table.with_suffix(".npz")
-
-
-def load_episodes(path: Path) -> Episodes:
-    """Every episode, seeds joined; empty where there is no file."""
-    found: Episodes = {}
-    if not path.exists():
-        return found
+def _joined(episodes: tables.Episodes) -> dict[str, dict[str, dict[str, DomainRecord]]]:
+    """task -> method -> domain -> episodes, seeds joined."""
     parts: dict[tuple[str, str, str], list[DomainRecord]] = {}
-    for name, record in records.load_eval(path).items():
-        task, method, _, domain = name.split("/")
-        parts.setdefault((task, method, domain), []).append(record)
+    for cell, by_domain in episodes.items():
+        for domain, record in by_domain.items():
+            parts.setdefault((cell.task, cell.method, domain), []).append(record)
+    found: dict[str, dict[str, dict[str, DomainRecord]]] = {}
     for (task, method, domain), several in parts.items():
         by_method = found.setdefault(task, {}).setdefault(method, {})
         by_method[domain] = records.joined(several)
@@ -258,18 +321,20 @@ def write(table_file: Path, page: Path) -> list[Path]:
     Raises:
       RecordError: the table or the page cannot be used; the message says why.
     """
-    table = records.load_json(table_file)
+    table, episodes = tables.load(table_file), tables.load_episodes(table_file)
     preset = table["header"]["preset"]
     if preset != records.file_word(preset):  # it becomes a folder's name and a comment's
         raise RecordError(f"{table_file}: expected a preset's name, got {preset!r}")
+    for cell in tables.cells(table, "results"):
+        tables.check_counts(table_file, table, cell, episodes)
     drawn = {
         task: draw(task, methods, page.parent / "images" / f"table_{preset}")
-        for task, methods in load_episodes(episodes_file(table_file)).items()
+        for task, methods in _joined(episodes).items()
     }
     relative = {t: [str(path.relative_to(page.parent)) for path in ps] for t, ps in drawn.items()}
     before, after = _around(page, preset)
     begin, end = markers(preset)
-    content = f"{before}{begin}\n\n{text(table, relative)}\n\n{end}{after}"
+    content = f"{before}{begin}\n\n{text(table, episodes, relative)}\n\n{end}{after}"
     write_atomic(page, content.encode())
     return [page, *(path for paths in drawn.values() for path in paths)]
 

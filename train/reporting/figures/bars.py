@@ -78,7 +78,7 @@ def domain_bars(
                 markersize=5,
                 markerfacecolor="white",
                 markeredgecolor=INK,
-                label="paper (mean of its 4 tasks)",
+                label="implied by the paper's Table I (its 4 tasks)",
             )
         )
     figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 5))

@@ -201,10 +201,10 @@ def sample_distribution(
         map_axes(above, left=column == 0)
         turned = _pick(domains, angle_domains)
         tallest = max(tallest, _angle_histogram(below, turned, regions))
-        scenes = sum(record.episodes for record in turned)
-        below.set_xlabel(f"camera angle   ({_names(angle_domains)}: {scenes} scenes)")
-        scenes = sum(record.episodes for record in placed)
-        above.set_xlabel(f"y (m)   ({_names(position_domains)}: {scenes} scenes)")
+        episodes = sum(record.episodes for record in turned)
+        below.set_xlabel(f"camera angle   ({_names(angle_domains)}: {episodes} episodes)")
+        episodes = sum(record.episodes for record in placed)
+        above.set_xlabel(f"y (m)   ({_names(position_domains)}: {episodes} episodes)")
         if column == 0:
             below.set_ylabel("episodes")
     for axes in grid[1]:
