@@ -258,8 +258,10 @@ def _run_cell(
     try:
         made = _made(config.folder / cell.name, fresh) if code == 0 else None
         words = f"exit code {code}"
-    except (ConfigError, records.RecordError) as error:  # of this cell alone: others go on
+    except ConfigError as error:  # of this cell alone: others go on
         made, words = None, str(error)
+    except records.RecordError as error:
+        made, words = None, f"{error}; move {config.folder / cell.name} away to make it again"
     with locks.locked(config.file):  # another process may write beside us
         table = read(config.file, fresh)
         if made is not None:
@@ -318,16 +320,18 @@ def _enter(table: dict[str, Any], path: Path, cell: Cell, made: _Made) -> None:
 
 def _hands(folder: Path) -> dict[str, Any] | None:
     """{"quoted": variant, "successes": {variant: {domain: n}}} of the hand's initial yaw; None for
-    a method that has but one."""
+    a method that has but one, and for notes that are none."""
     notes = records.load_notes(folder / "eval_variants.json")
-    quoted = notes.pop("quoted", None)
-    if quoted not in notes or len(notes) < 2:
+    quoted = str(notes.pop("quoted", None))
+    try:
+        successes = {
+            variant: {domain: int(entry["successes"]) for domain, entry in domains.items()}
+            for variant, domains in notes.items()
+        }
+    except (AttributeError, KeyError, TypeError, ValueError):
         return None
-    successes = {
-        variant: {domain: entry["successes"] for domain, entry in domains.items()}
-        for variant, domains in notes.items()
-    }
-    return {"quoted": quoted, "successes": successes}
+    several = len(successes) > 1 and quoted in successes
+    return {"quoted": quoted, "successes": successes} if several else None
 
 
 def _check_versions(

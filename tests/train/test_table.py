@@ -312,6 +312,14 @@ def test_a_cell_of_other_versions_is_not_entered(
     assert run(config) == 0
 
 
+@pytest.mark.parametrize(
+    "notes", ["{", "[]", '{"quoted": ["x"], "x": 1}', '{"quoted": "a", "a": {"in_domain": 3}}']
+)
+def test_notes_of_hands_that_are_none_cost_no_results(notes: str, tmp_path: Path) -> None:
+    (tmp_path / "eval_variants.json").write_text(notes)
+    assert table._hands(tmp_path) is None
+
+
 @pytest.mark.parametrize("name", ["env.json", "eval.json", "eval.npz"])
 def test_a_cell_that_left_a_damaged_file_costs_that_cell_alone(
     name: str,
