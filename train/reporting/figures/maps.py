@@ -2,16 +2,19 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib import patheffects
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from palm_jax.train.files.records import DomainRecord
 from palm_jax.train.reporting import paper
@@ -209,19 +212,33 @@ def sample_distribution(
             below.set_ylabel("episodes")
     for axes in grid[1]:
         axes.set_ylim(0, 1.22 * tallest)
+    several = any(
+        len(_scenes(record)[0]) < record.episodes
+        for domains in records.values()
+        for record in _pick(domains, position_domains)
+    )
+    handles = _sample_handles(several=several)
     figure.legend(
-        handles=[
-            Line2D([], [], color=GOOD, marker="o", linestyle="", markersize=5, label="success"),
-            Line2D([], [], color=BAD, marker="x", linestyle="", markersize=5, label="failure"),
-            Patch(fill=False, edgecolor=INK, linestyle=(0, (4, 2)), label="training bounds"),
-            Patch(fill=False, edgecolor=TEST_REGION, label="test bounds"),
-        ],
+        handles=handles,
         loc="outside lower center",
-        ncols=4 if len(records) > 1 else 2,  # one column of axes is too narrow for four
+        ncols=len(handles) if len(records) > 1 else 2,  # one column of axes is too narrow for all
     )
     if title:
         figure.suptitle(title, x=0.01, ha="left", fontweight="bold", fontsize=11)
     return figure
+
+
+def _sample_handles(*, several: bool) -> list[Artist]:
+    """What the marks mean; `several` policies in the same scenes may come to different ends."""
+    mark = partial(Line2D, [], [], linestyle="", markersize=5)
+    some = mark(color=GOOD, marker="o", markerfacecolor="white", label="of some seeds")
+    return [
+        mark(color=GOOD, marker="o", label="success"),
+        *([some] if several else []),
+        mark(color=BAD, marker="x", label="failure"),
+        Patch(fill=False, edgecolor=INK, linestyle=(0, (4, 2)), label="training bounds"),
+        Patch(fill=False, edgecolor=TEST_REGION, label="test bounds"),
+    ]
 
 
 def _names(domains: Sequence[str]) -> str:
@@ -233,23 +250,28 @@ def _pick(domains: Mapping[str, DomainRecord], wanted: Sequence[str]) -> list[Do
     return [record for name, record in domains.items() if paper.domain_key(name) in keys]
 
 
+def _scenes(record: DomainRecord) -> tuple[Array, Array]:
+    """Where the object of each scene lay [S, 2], and the share of the policies that were tried
+    there which solved it [S]: seeds that are joined share their scenes."""
+    xy, scene = np.unique(record.object_xy.astype(float), axis=0, return_inverse=True)
+    scene = scene.reshape(-1)
+    return xy, np.bincount(scene, weights=record.solved) / np.bincount(scene)
+
+
 def _scatter(axes: Axes, records: list[DomainRecord], regions: Regions) -> None:
     for record in records:
-        xy, solved = record.object_xy, record.solved
-        axes.scatter(
-            xy[~solved, 1], xy[~solved, 0], s=20, marker="x", color=BAD, linewidth=1.1, zorder=3
-        )
-        axes.scatter(
-            xy[solved, 1],
-            xy[solved, 0],
-            s=20,
-            marker="o",
-            color=GOOD,
-            alpha=0.85,
-            linewidth=0.4,
-            edgecolors="white",
-            zorder=3,
-        )
+        xy, share = _scenes(record)
+        never, always = share == 0, share == 1
+        styles: list[tuple[NDArray[np.bool_], dict[str, Any]]] = [
+            (never, {"marker": "x", "color": BAD, "linewidth": 1.1}),
+            (
+                ~never & ~always,
+                {"marker": "o", "facecolor": "white", "edgecolors": GOOD, "linewidth": 1.1},
+            ),
+            (always, {"marker": "o", "color": GOOD, "linewidth": 0.4, "edgecolors": "white"}),
+        ]
+        for chosen, style in styles:
+            axes.scatter(xy[chosen, 1], xy[chosen, 0], s=20, zorder=3, **style)
     outline(axes, regions.test_x, regions.test_y, edgecolor=TEST_REGION, linewidth=1.5)
     outline(
         axes, regions.train_x, regions.train_y, edgecolor=INK, linewidth=1.4, linestyle=(0, (4, 2))
