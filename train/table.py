@@ -472,9 +472,14 @@ def _environment() -> dict[str, str]:
     return {**ours, **os.environ}
 
 
-def _merge(table: dict[str, Any], path: Path, fresh: dict[str, Any]) -> tables.Episodes:
-    """Takes over what only the other file has; returns the episodes of the cells that came with
-    results.
+def _merge(
+    table: dict[str, Any], path: Path, fresh: dict[str, Any]
+) -> tuple[tables.Episodes, list[Cell]]:
+    """Takes over what only the other file has.
+
+    Returns:
+      the episodes of the cells that came with results, and the cells of which the table keeps
+      other results than the file's.
 
     Raises:
       ConfigError: there is no such file, or one of other conditions.
@@ -499,7 +504,7 @@ def _merge(table: dict[str, Any], path: Path, fresh: dict[str, Any]) -> tables.E
             tables.put(table, "failed", cell, tables.get(other, "failed", cell))
     if taken:
         _note_origin(table["header"], other["header"])
-    return taken
+    return taken, _other_results(table, other)
 
 
 def _merge_all(
@@ -507,8 +512,8 @@ def _merge_all(
 ) -> None:
     taken = tables.Episodes()
     for path in config.merge:
-        found = _merge(table, path, fresh)
-        for cell in _other_results(table, tables.load(path)):
+        found, left_out = _merge(table, path, fresh)
+        for cell in left_out:
             console.print(
                 f"{cell.name}: {path} has other results of it, which are left out: of a cell that "
                 "was run twice the first one counts",
