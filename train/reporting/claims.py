@@ -215,8 +215,9 @@ def _c6(p: Posterior) -> list[Question]:
     ]
 
 
-def _for_it(question: Question) -> tuple[bool, float]:
-    """Least in the domain that decides on an "anywhere": one that refutes it, if there is one."""
+def _support(question: Question) -> tuple[bool, float]:
+    """Sorts domains by how well they bear out an "everywhere": what refutes it comes first, then the
+    lowest lower end."""
     return question.difference.high >= 0, question.difference.low
 
 
@@ -236,7 +237,7 @@ def _c7(p: Posterior) -> list[Question]:
             )
             for key in paper.OOD_DOMAINS
         ]
-        questions.append(min(every, key=_for_it))
+        questions.append(min(every, key=_support))
     return questions
 
 
