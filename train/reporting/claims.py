@@ -216,8 +216,8 @@ def _c6(p: Posterior) -> list[Question]:
 
 
 def _support(question: Question) -> tuple[bool, float]:
-    """Sorts domains by how well they bear out an "everywhere": what refutes it comes first, then the
-    lowest lower end."""
+    """Sorts domains by how well they bear out an "everywhere": what refutes it comes first, then
+    the lowest lower end."""
     return question.difference.high >= 0, question.difference.low
 
 
